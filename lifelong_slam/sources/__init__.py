@@ -1,0 +1,1 @@
+"""Where scans come from: bags, folders, data sets, the simulator."""
