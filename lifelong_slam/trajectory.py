@@ -72,8 +72,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
             trajectory.stamps.tolist(), trajectory.positions, quaternions, strict=True
         ):
             values = " ".join(repr(float(v)) for v in (*position, *quaternion))
-            seconds, nanoseconds = divmod(stamp, NANOSECONDS)
-            file.write(f"{seconds}.{nanoseconds:09d} {values}\n".encode())
+            file.write(f"{format_seconds(stamp)} {values}\n".encode())
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -94,6 +93,12 @@ def read_tum(path: Path) -> Trajectory:
         return Trajectory(stamps, from_quaternion(values[:, :3], values[:, 3:]))
     except ValueError as error:
         raise SourceError(f"{path} is not a TUM trajectory: {error}") from error
+
+
+def format_seconds(stamp: int) -> str:
+    """Turn nanoseconds into decimal seconds with nine digits, without a float's loss of digits."""
+    seconds, nanoseconds = divmod(abs(stamp), NANOSECONDS)
+    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def parse_seconds(text: str) -> int:

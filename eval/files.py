@@ -1,0 +1,206 @@
+"""Reads the standard files that SLAM systems leave behind, and writes the verdict.
+
+Trajectories are evo's `PoseTrajectory3D`. Of evo, only `core` and `tools.file_interface` are
+imported: they neither read nor write evo's settings in the user's home.
+"""
+
+import csv
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from evo import EvoException
+from evo.core.trajectory import PosePath3D, PoseTrajectory3D
+from evo.tools import file_interface
+from numpy.typing import NDArray
+
+from eval.errors import FileError
+
+Timeline = dict[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class GraphSketch:
+    """What a picture or a count needs of a pose graph.
+
+    Attributes:
+        positions: (V, 3) positions of the vertices in metres.
+        edges: (E, 2) indices into `positions`.
+        is_loop: (E,) whether an edge closes a loop.
+    """
+
+    positions: NDArray[np.float64]
+    edges: NDArray[np.int64]
+    is_loop: NDArray[np.bool_]
+
+
+def read_tum(path: Path) -> PoseTrajectory3D:
+    """Read a TUM trajectory, ``stamp[s] x y z qx qy qz qw`` a line.
+
+    Raises:
+        FileError: the file is missing or malformed, holds NaN, or its stamps run back.
+    """
+    _require(path, "trajectory")
+    try:
+        trajectory = file_interface.read_tum_trajectory_file(str(path))
+    except (EvoException, ValueError, UnicodeDecodeError) as error:
+        raise FileError(f"{path} is not a TUM trajectory: {error}") from error
+    _check_finite(path, trajectory)
+    stamps = trajectory.timestamps
+    if not np.isfinite(stamps).all() or (np.diff(stamps) < 0).any():
+        raise FileError(f"{path}: stamps must not run back or be NaN")
+    return trajectory
+
+
+def read_kitti(path: Path) -> PosePath3D:
+    """Read a KITTI trajectory: the 12 numbers of a 3x4 pose a line, no stamps.
+
+    Raises:
+        FileError: the file is missing or malformed, or holds NaN.
+    """
+    _require(path, "trajectory")
+    try:
+        trajectory = file_interface.read_kitti_poses_file(str(path))
+    except (EvoException, ValueError, UnicodeDecodeError) as error:
+        raise FileError(f"{path} is not a KITTI trajectory: {error}") from error
+    _check_finite(path, trajectory)
+    return trajectory
+
+
+def read_points(path: Path) -> NDArray[np.float32]:
+    """Read the (N, 3) points of a PLY, PCD or other cloud that Open3D knows, in metres.
+
+    Raises:
+        FileError: the file is missing or holds no points that Open3D can read.
+    """
+    import open3d as o3d  # takes a second: not where only trajectories are compared
+
+    _require(path, "map")
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.t.io.read_point_cloud(path)
+    if "positions" not in cloud.point:
+        if _says_empty(path):
+            return np.zeros((0, 3), dtype=np.float32)
+        raise FileError(f"{path} holds no points that Open3D can read")
+    return np.asarray(cloud.point.positions.numpy(), dtype=np.float32)
+
+
+def read_graph(path: Path) -> GraphSketch:
+    """Read vertices and edges of an SE(3) g2o file.
+
+    Comment lines ``# odometry`` and ``# loop`` name the kind of the edges after them. Without them,
+    an edge to the vertex with the next id counts as odometry and any other as a loop closure.
+
+    Raises:
+        FileError: the file is missing, or a line is malformed.
+    """
+    _require(path, "pose graph")
+    positions: dict[int, list[float]] = {}
+    edges: list[tuple[int, int, str]] = []
+    kind = ""
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        tag, *fields = line.split() or [""]
+        try:
+            if tag == "VERTEX_SE3:QUAT":
+                positions[int(fields[0])] = [float(field) for field in fields[1:4]]
+            elif tag == "EDGE_SE3:QUAT":
+                edges.append((int(fields[0]), int(fields[1]), kind))
+            elif tag == "#" and fields in (["odometry"], ["loop"]):
+                kind = fields[0]
+        except (ValueError, IndexError) as error:
+            raise FileError(f"{path}, line {number}: not a valid {tag}") from error
+    return _sketch(path, positions, edges)
+
+
+def read_timeline(path: Path) -> Timeline:
+    """Read a CSV file of numbers into one (N,) array a column.
+
+    Raises:
+        FileError: the file is missing, has no header, or a cell is not a number.
+    """
+    _require(path, "timeline")
+    with path.open(newline="") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    try:
+        values = np.array([[float(cell) for cell in row] for row in rows])
+        values = values.reshape(len(rows), len(header))
+    except ValueError as error:
+        raise FileError(f"{path} is not a table of numbers: {error}") from error
+    return {name: values[:, i] for i, name in enumerate(header)}
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write strict JSON (NaN and infinity become null), replacing the file as a whole."""
+    text = json.dumps(_strict(value), indent=2, allow_nan=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n")
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; it replaces `path` on success, goes on failure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _strict(value: Any) -> Any:
+    """Turn NumPy's scalars and arrays, paths and non-finite numbers into what JSON can say."""
+    if isinstance(value, dict):
+        return {str(key): _strict(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | list | tuple | set):
+        return [_strict(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value if value is None else str(value)
+
+
+def _sketch(
+    path: Path, positions: dict[int, list[float]], edges: list[tuple[int, int, str]]
+) -> GraphSketch:
+    ids = sorted(positions)
+    index = {vertex: i for i, vertex in enumerate(ids)}
+    unknown = {v for source, target, _ in edges for v in (source, target)} - index.keys()
+    if unknown:
+        raise FileError(f"{path}: edges refer to {len(unknown)} vertices that are not there")
+    pairs = np.array([(index[s], index[t]) for s, t, _ in edges], dtype=np.int64).reshape(-1, 2)
+    named = np.array([kind for *_, kind in edges], dtype="U8")
+    is_loop = np.where(named == "", pairs[:, 1] - pairs[:, 0] != 1, named == "loop")
+    points = np.array([positions[i] for i in ids], dtype=np.float64).reshape(-1, 3)
+    return GraphSketch(points, pairs, is_loop)
+
+
+def _require(path: Path, what: str) -> None:
+    if not path.is_file():
+        raise FileError(f"no such {what} file: {path}")
+
+
+def _check_finite(path: Path, trajectory: PosePath3D) -> None:
+    if not np.isfinite(trajectory.positions_xyz).all():
+        raise FileError(f"{path} holds NaN or infinite positions")
+
+
+def _says_empty(path: Path) -> bool:
+    """Whether a PLY header announces no vertices."""
+    with path.open("rb") as file:
+        return b"element vertex 0\n" in file.read(1000)

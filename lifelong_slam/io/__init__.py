@@ -1,0 +1,1 @@
+"""Writers and readers of the standard files that a run leaves behind."""

@@ -1,0 +1,1 @@
+"""Front ends: scan-to-scan motion from scans alone."""

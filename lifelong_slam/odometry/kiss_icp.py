@@ -1,0 +1,136 @@
+"""KISS-ICP (Vizzo et al., RA-L 2023) as a front end, with motion scaled to the real sweep.
+
+The parts are the kiss_icp package's own: preprocessing, voxel map, adaptive threshold, registration.
+What is ours is how they are driven:
+
+- the constant-velocity model knows time, so a lost scan or an uneven rate doesn't break the prediction,
+  and a sweep is deskewed by its own duration (a sensor cropped to 120 degrees takes a third of its
+  period; KISS-ICP would spread the whole period's motion over it);
+- the first two scans are registered twice, for the motion and then deskewed by it;
+- motions that the model did not predict are checked (`motion_check`).
+"""
+
+import logging
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.config.config import (
+    AdaptiveThresholdConfig,
+    DataConfig,
+    MappingConfig,
+    RegistrationConfig,
+)
+from kiss_icp.kiss_icp import KissICP
+from numpy.typing import NDArray
+
+from lifelong_slam.geometry import exp, invert, log
+from lifelong_slam.odometry.motion_check import MotionCheck
+from lifelong_slam.odometry.odometry import OdometryEstimate
+from lifelong_slam.scan import NANOSECONDS, Scan
+
+Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
+
+_GAP = 3.0  # usual periods without a scan, after which the velocity says little
+
+
+class KissIcpOdometry:
+    """Scan-to-map odometry; see the module's text for what differs from the bare package."""
+
+    def __init__(
+        self,
+        voxel_size: float,
+        min_range: float,
+        max_range: float,
+        max_points_per_voxel: int = 20,
+        convergence_criterion: float = 1e-3,
+    ) -> None:
+        """Set up.
+
+        Args:
+            voxel_size: of the local map, metres.
+            min_range: points nearer than this are dropped, metres.
+            max_range: points further away are dropped, metres.
+            max_points_per_voxel: density of the local map.
+            convergence_criterion: norm of the last step at which ICP stops. KISS-ICP's own 1e-4
+                spends a fifth of its time on tenths of a millimetre.
+        """
+        config = KISSConfig(
+            data=DataConfig(min_range=min_range, max_range=max_range, deskew=True),
+            mapping=MappingConfig(voxel_size=voxel_size, max_points_per_voxel=max_points_per_voxel),
+            registration=RegistrationConfig(
+                # One thread: TBB's sums depend on scheduling, and runs must repeat to the digit.
+                max_num_threads=1,
+                convergence_criterion=convergence_criterion,
+            ),
+            adaptive_threshold=AdaptiveThresholdConfig(),
+        )
+        self._kiss = KissICP(config)
+        self._check = MotionCheck(voxel_size)
+        self._velocity = np.zeros(6)  # tangent of T_last_next a second
+        self._last: OdometryEstimate | None = None
+        self._first_scan: Scan | None = None
+        self._period = 0.0
+
+    def register(self, scan: Scan) -> OdometryEstimate:
+        """Estimate the pose of a cleaned scan that is newer than all before it."""
+        if self._last is None:
+            self._first_scan = scan
+            estimate = self._accept(scan, np.eye(4), self._deskew(scan))
+        else:
+            if self._first_scan is not None:
+                self._start_over(self._first_scan, scan)
+            estimate = self._track(scan, self._last)
+        self._last = estimate
+        return estimate
+
+    def _track(self, scan: Scan, last: OdometryEstimate) -> OdometryEstimate:
+        interval = (scan.end_stamp - last.stamp) / NANOSECONDS
+        points = self._deskew(scan)
+        source, _ = self._kiss.voxelize(points)
+        predicted = last.T_odom_sensor @ exp(self._velocity * interval)
+        sigma = self._kiss.adaptive_threshold.get_threshold()
+        T = self._kiss.registration.align_points_to_map(
+            points=source,
+            voxel_map=self._kiss.local_map,
+            initial_guess=predicted,
+            max_correspondance_distance=3 * sigma,
+            kernel=sigma,
+        )
+        if self._is_gap(interval) or self._check.is_suspicious(predicted, T):
+            T = self._check.resolve(points, last.T_odom_sensor, [T, predicted])
+        self._kiss.adaptive_threshold.update_model_deviation(invert(predicted) @ T)
+        self._velocity = log(invert(last.T_odom_sensor) @ T) / interval
+        return self._accept(scan, T, points)
+
+    def _start_over(self, first: Scan, second: Scan) -> None:
+        """Find the motion between the first two scans, then enter the first one deskewed by it."""
+        self._first_scan = None
+        interval = (second.end_stamp - first.end_stamp) / NANOSECONDS
+        for _ in range(2):  # as recorded, then freed of the distortion that the first answer implies
+            motion = self._check.first_motion(self._deskew(first), self._deskew(second))
+            self._velocity = log(motion) / interval
+        logger.info("starting at %.1f m/s", np.linalg.norm(self._velocity[3:]))
+        self._kiss.local_map.clear()
+        self._check = MotionCheck(self._kiss.config.mapping.voxel_size)
+        self._last = self._accept(first, np.eye(4), self._deskew(first))
+
+    def _deskew(self, scan: Scan) -> Array:
+        """Crop a scan to range and move its points to the sensor's frame at the sweep's end."""
+        timed = scan.offsets is not None and scan.duration > 0
+        motion = exp(self._velocity * scan.duration) if timed else np.eye(4)
+        offsets = scan.offsets if timed and scan.offsets is not None else np.zeros(0)
+        return np.asarray(self._kiss.preprocessor.preprocess(scan.points, offsets, motion))
+
+    def _accept(self, scan: Scan, T_odom_sensor: Array, points: Array) -> OdometryEstimate:
+        """Enter a registered scan into the local map."""
+        _, downsampled = self._kiss.voxelize(points)
+        self._kiss.local_map.update(downsampled, T_odom_sensor)
+        self._check.remember(downsampled, T_odom_sensor)
+        return OdometryEstimate(scan.end_stamp, T_odom_sensor, points)
+
+    def _is_gap(self, interval: float) -> bool:
+        """Tell whether scans are missing, and learn the usual period."""
+        gap = self._period > 0 and interval > _GAP * self._period
+        self._period = interval if self._period == 0 else 0.9 * self._period + 0.1 * interval
+        return gap

@@ -1,0 +1,91 @@
+"""A second opinion on the front end's motion, asked for when its own can't be trusted.
+
+Point-to-point ICP on a coarse voxel map has two ways to fail without a sign. At the start of a
+recording that begins at speed it locks at zero motion: the rings that a LiDAR draws on the ground
+move with the car, and nothing says that the car does. And a hand-held sensor turns between two scans
+by more than ICP's basin of convergence. Both show as a motion that the constant-velocity model did
+not predict, or could not. Then, and only then, several motions are tried by generalised ICP, whose
+planes slide freely along the ground, and the one that puts most points onto known surfaces wins.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.geometry import exp, invert, rotation_angle, transform
+from lifelong_slam.registration import Cloud, Registration, register
+
+Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
+
+_RECENT_SCANS = 20  # what a suspicious motion is checked against
+_YAW_GUESSES = (-0.3, -0.15, 0.15, 0.3)  # rad about the vertical; hand-held sensors reach 0.25 a scan
+_START_DISTANCES = (1.5, 3.0)  # metres a scan; 3 m at 10 Hz is 108 km/h
+_START_DIRECTIONS = 8
+_MAX_ROTATION = 0.035  # rad (2 degrees) beside the prediction that ICP's basin surely covers
+_MAX_TRANSLATION = 0.3  # the same in voxels
+_MIN_OVERLAP = 0.4  # below it not even the best guess is an answer
+
+
+class MotionCheck:
+    """Remembers the recent scans and re-registers a suspicious one against them."""
+
+    def __init__(self, voxel_size: float) -> None:
+        """Set up.
+
+        Args:
+            voxel_size: of the front end's local map, metres; checks use half of it.
+        """
+        self._voxel_size = voxel_size
+        self._recent: deque[tuple[Array, Array]] = deque(maxlen=_RECENT_SCANS)
+        self.checks = 0
+
+    def remember(self, points: Array, T_odom_sensor: Array) -> None:
+        """Keep a registered scan's (N, 3) points for later checks."""
+        self._recent.append((points, T_odom_sensor))
+
+    def is_suspicious(self, T_predicted: Array, T_estimated: Array) -> bool:
+        """Tell whether an estimate lies outside the basin around its prediction."""
+        deviation = invert(T_predicted) @ T_estimated
+        return bool(
+            rotation_angle(deviation) > _MAX_ROTATION
+            or np.linalg.norm(deviation[:3, 3]) > _MAX_TRANSLATION * self._voxel_size
+        )
+
+    def resolve(self, points: Array, T_last: Array, guesses: Sequence[Array]) -> Array:
+        """Return the best pose for (N, 3) points, starting from guesses and turns of the last pose.
+
+        Falls back on the first guess where nothing fits.
+        """
+        self.checks += 1
+        target = np.vstack([transform(pose, cloud) for cloud, pose in self._recent])
+        turns = [T_last @ exp(np.array([0, 0, yaw, 0, 0, 0])) for yaw in _YAW_GUESSES]
+        best = self._register(target, points, [*guesses, T_last, *turns])
+        return best.T_target_source if best.overlap >= _MIN_OVERLAP else guesses[0]
+
+    def first_motion(self, first: Array, second: Array) -> Array:
+        """Return T_first_second of two scans about which nothing is known, the identity if none fits.
+
+        Tries standing still and motions in all horizontal directions.
+        """
+        self.checks += 1
+        angles = np.arange(_START_DIRECTIONS) * 2 * np.pi / _START_DIRECTIONS
+        shifts = [
+            np.array([0, 0, 0, d * np.cos(a), d * np.sin(a), 0])
+            for d in _START_DISTANCES
+            for a in angles
+        ]
+        best = self._register(first, second, [np.eye(4), *(exp(shift) for shift in shifts)])
+        if best.overlap < _MIN_OVERLAP:
+            logger.warning("the first two scans do not fit together; assuming standstill")
+            return np.eye(4)
+        return best.T_target_source
+
+    def _register(self, target: Array, source: Array, guesses: Sequence[Array]) -> Registration:
+        voxel = self._voxel_size / 2
+        return register(
+            Cloud.prepare(target, voxel), Cloud.prepare(source, voxel), guesses, self._voxel_size
+        )

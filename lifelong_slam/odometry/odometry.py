@@ -1,0 +1,32 @@
+"""The protocol of an odometry front end."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.scan import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryEstimate:
+    """Where the sensor was at the end of a sweep, and the sweep freed of motion distortion.
+
+    Attributes:
+        stamp: instant of the sweep's last point in nanoseconds; the pose holds here.
+        T_odom_sensor: (4, 4).
+        points: (N, 3) deskewed points in range, metres, in the sensor's frame at `stamp`.
+    """
+
+    stamp: int
+    T_odom_sensor: NDArray[np.float64]
+    points: NDArray[np.float64]
+
+
+class Odometry(Protocol):
+    """Registers scans one after the other."""
+
+    def register(self, scan: Scan) -> OdometryEstimate:
+        """Estimate the pose of a cleaned scan that is newer than all before it."""
+        ...

@@ -1,0 +1,131 @@
+"""Writes the run folder: everything that a run leaves behind, as standard files.
+
+Systems work in the sensor's frame; here, and only here, results become poses of the base. The
+map's frame is the base's pose where the system's own map has the sensor's, so with the calibration
+X = `T_base_sensor` each pose becomes ``X T_map_sensor(i) X^-1`` and each map point ``X p``.
+"""
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.files import atomic_write
+from lifelong_slam.geometry import adjoint, invert, transform
+from lifelong_slam.io.bags import write_cloud_bag, write_pose_bag
+from lifelong_slam.io.g2o import write_g2o
+from lifelong_slam.io.ply import write_ply
+from lifelong_slam.result import Edge, GraphSnapshot
+from lifelong_slam.trajectory import Trajectory, format_seconds, write_tum
+
+if TYPE_CHECKING:
+    from lifelong_slam.runner import RunRecord, TimelineRow
+
+TRAJECTORY = "trajectory.tum"
+REFERENCE = "reference.tum"
+POSE_GRAPH = "pose_graph.g2o"
+TIMELINE = "timeline.csv"
+_COLUMNS = (
+    "stamp",
+    "odometry_ms",
+    "loop_ms",
+    "optimise_ms",
+    "prune_ms",
+    "vertices",
+    "edges",
+    "rss_mb",
+)
+_BLOCK = 1_000_000
+
+
+def write_run(
+    folder: Path,
+    record: "RunRecord",
+    reference: Trajectory | None,
+    T_base_sensor: NDArray[np.float64],
+) -> None:
+    """Write trajectories, map, pose graph and timeline of a finished run.
+
+    Args:
+        folder: made if it is missing; each file in it is replaced as a whole.
+        record: what the run produced, in the sensor's frame.
+        reference: T_world_base of the source, written as it is, or None.
+        T_base_sensor: (4, 4) pose of the sensor on the base.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    result = record.result
+    trajectory = trajectory_to_base(result.trajectory, T_base_sensor)
+    write_tum(folder / TRAJECTORY, trajectory)
+    topics = {"/trajectory/base/pose": trajectory}
+    if reference is None:
+        (folder / REFERENCE).unlink(missing_ok=True)
+    else:
+        write_tum(folder / REFERENCE, reference)
+        topics["/odometry/base/pose"] = reference
+    write_pose_bag(folder / "trajectory.bag", topics)
+    points = points_to_base(result.map_points, T_base_sensor)
+    stamp = int(trajectory.stamps[-1]) if len(trajectory) else 0
+    write_ply(folder / "map.ply", points)
+    write_cloud_bag(folder / "map.bag", "/map", "map", stamp, points)
+    write_g2o(folder / POSE_GRAPH, graph_to_base(result.graph, T_base_sensor))
+    write_timeline(folder / TIMELINE, record.timeline)
+
+
+def trajectory_to_base(trajectory: Trajectory, T_base_sensor: NDArray[np.float64]) -> Trajectory:
+    """Turn poses of the sensor into poses of the base."""
+    poses = T_base_sensor @ trajectory.poses @ invert(T_base_sensor)
+    return Trajectory(trajectory.stamps, poses)
+
+
+def points_to_base(
+    points: NDArray[np.float32], T_base_sensor: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Turn (N, 3) map points from the sensor's map frame to the base's, in blocks of memory."""
+    moved = np.empty((len(points), 3), dtype=np.float32)
+    for start in range(0, len(points), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        moved[block] = transform(T_base_sensor, points[block].astype(np.float64))
+    return moved
+
+
+def graph_to_base(graph: GraphSnapshot, T_base_sensor: NDArray[np.float64]) -> GraphSnapshot:
+    """Turn a graph of sensor poses into one of base poses.
+
+    With X the calibration, ``X T Exp(xi) X^-1 = (X T X^-1) Exp(Ad(X) xi)``: a covariance C in the
+    target's frame becomes ``Ad(X) C Ad(X)^T``.
+    """
+    inverse = invert(T_base_sensor)
+    A = adjoint(T_base_sensor)
+    edges = [
+        Edge(
+            edge.source,
+            edge.target,
+            T_base_sensor @ edge.T_source_target @ inverse,
+            A @ edge.covariance @ A.T,
+            edge.kind,
+        )
+        for edge in graph.edges
+    ]
+    return GraphSnapshot(
+        {i: T_base_sensor @ pose @ inverse for i, pose in graph.poses.items()}, edges
+    )
+
+
+def write_timeline(path: Path, rows: "list[TimelineRow]") -> None:
+    """Write one CSV row a scan: stamp in seconds, times of the stages in ms, graph size, memory."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for row in rows:
+        values = [getattr(row, column) for column in _COLUMNS[1:]]
+        writer.writerow([format_seconds(row.stamp), *map(_number, values)])
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())
+
+
+def _number(value: float) -> str:
+    """Format a count as it is and a measurement to the microsecond or kilobyte."""
+    return str(value) if isinstance(value, int) else f"{value:.3f}"

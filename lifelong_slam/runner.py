@@ -1,0 +1,230 @@
+"""Drive a SLAM system over a source, from the first scan to the last or until asked to stop.
+
+Signals: after the first scan, SIGINT or SIGTERM asks the loop to end after the scan at hand, so
+that what is mapped so far can be written; the second one aborts at once. Before the first scan
+there is nothing to write and the first signal aborts.
+"""
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Any, Protocol
+
+import psutil
+
+from lifelong_slam.result import SlamResult, StageTimes
+from lifelong_slam.scan import Scan
+from lifelong_slam.sources.cleaning import InputCounts, clean
+from lifelong_slam.sources.source import Source
+from lifelong_slam.systems.system import System
+
+_log = logging.getLogger(__name__)
+_MEGABYTE = 1e6
+_SAMPLING_PERIOD = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class TimelineRow:
+    """Where the time of one scan went, and what the run held after it (a row of timeline.csv)."""
+
+    stamp: int
+    odometry_ms: float
+    loop_ms: float
+    optimise_ms: float
+    prune_ms: float
+    vertices: int
+    edges: int
+    rss_mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """A finished run, whatever the system.
+
+    Attributes:
+        result: what the system estimated.
+        timeline: one row a scan.
+        counts: what was seen, repaired and left out of the input.
+        wall_seconds: from asking for the first scan to the system's result, reading included.
+        peak_rss_mb: largest resident memory of the process during the run, sampled at 10 Hz.
+        interrupted: the run was asked to stop before the last scan.
+        cpu_percent: processor time over wall time; 100 is one core in full use.
+        info: versions, seed, machine and settings that make the run repeatable.
+    """
+
+    result: SlamResult
+    timeline: list[TimelineRow]
+    counts: dict[str, int]
+    wall_seconds: float
+    peak_rss_mb: float
+    interrupted: bool
+    cpu_percent: float = 0.0
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def scans_per_second(self) -> float:
+        """Scans a second over the whole run, finishing included."""
+        return len(self.timeline) / self.wall_seconds if self.wall_seconds > 0 else 0.0
+
+
+class Observer(Protocol):
+    """Whoever wants to know about every scan that was taken in, such as a progress bar."""
+
+    def update(self, scan: Scan, times: StageTimes) -> None:
+        """Hear of one more processed scan."""
+        ...
+
+
+class StopRequest:
+    """Whether the run has begun, and whether someone asked for its end."""
+
+    def __init__(self) -> None:
+        self.running = False
+        self.requested = False
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal: a polite one while scans flow, else (and the second time) an abort."""
+        if not self.running or self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        _log.warning(
+            "%s: stopping after this scan and writing what is mapped so far; once more aborts",
+            signal.Signals(number).name,
+        )
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopRequest]:
+    """Turn SIGINT and SIGTERM into a request to stop; other threads than the main one can't."""
+    stop = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, stop.handle) for number in numbers]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
+
+
+class ResourceMonitor:
+    """Samples the process's memory in a thread of its own, and takes its processor time."""
+
+    def __init__(self) -> None:
+        self._process = psutil.Process(os.getpid())
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+        self._start = (0.0, 0.0)
+        self.peak_rss_mb = 0.0
+        self.wall_seconds = 0.0
+        self.cpu_percent = 0.0
+
+    def __enter__(self) -> "ResourceMonitor":
+        self._start = (time.perf_counter(), time.process_time())
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.wall_seconds = time.perf_counter() - self._start[0]
+        self.cpu_percent = 100.0 * (time.process_time() - self._start[1]) / self.wall_seconds
+        self._done.set()
+        self._thread.join()
+        self.rss_mb()
+
+    def rss_mb(self) -> float:
+        """Return the resident memory now, and remember the largest value seen."""
+        rss = float(self._process.memory_info().rss) / _MEGABYTE
+        self.peak_rss_mb = max(self.peak_rss_mb, rss)
+        return rss
+
+    def _sample(self) -> None:
+        while not self._done.wait(_SAMPLING_PERIOD):
+            self.rss_mb()
+
+
+def run(
+    source: Source,
+    system: System,
+    observers: Sequence[Observer] = (),
+    stop: StopRequest | None = None,
+    info: dict[str, Any] | None = None,
+) -> RunRecord:
+    """Feed every usable scan of a source to a system.
+
+    Args:
+        source: where the scans come from.
+        system: what to run on them.
+        observers: told of every scan that was processed.
+        stop: ends the run early when it is requested.
+        info: facts about the run to keep in its record.
+
+    Raises:
+        SourceError: the recording can't be read, or holds no usable scan.
+    """
+    stop = stop or StopRequest()
+    counts = InputCounts()
+    with ResourceMonitor() as monitor:
+        timeline = _feed(clean(source, counts), system, observers, stop, monitor)
+        interrupted = stop.requested
+        result = system.finish()
+    return RunRecord(
+        result=result,
+        timeline=timeline,
+        counts=_flat(counts),
+        wall_seconds=monitor.wall_seconds,
+        peak_rss_mb=monitor.peak_rss_mb,
+        interrupted=interrupted,
+        cpu_percent=monitor.cpu_percent,
+        info=info or {},
+    )
+
+
+def _feed(
+    scans: Iterator[Scan],
+    system: System,
+    observers: Sequence[Observer],
+    stop: StopRequest,
+    monitor: ResourceMonitor,
+) -> list[TimelineRow]:
+    timeline = []
+    for scan in scans:
+        stop.running = True
+        times = system.process(scan)
+        timeline.append(_row(scan, times, monitor.rss_mb()))
+        for observer in observers:
+            observer.update(scan, times)
+        if stop.requested:
+            break
+    return timeline
+
+
+def _row(scan: Scan, times: StageTimes, rss_mb: float) -> TimelineRow:
+    return TimelineRow(
+        stamp=scan.end_stamp,
+        odometry_ms=times.odometry_ms,
+        loop_ms=times.loop_ms,
+        optimise_ms=times.optimise_ms,
+        prune_ms=times.prune_ms,
+        vertices=times.vertices,
+        edges=times.edges,
+        rss_mb=rss_mb,
+    )
+
+
+def _flat(counts: InputCounts) -> dict[str, int]:
+    skipped = {f"skipped: {reason}": number for reason, number in sorted(counts.skipped.items())}
+    return {
+        "read": counts.read,
+        "used": counts.used,
+        **skipped,
+        "dropped_points": counts.dropped_points,
+        "gaps": counts.gaps,
+    }

@@ -1,0 +1,1 @@
+"""Simulated campaigns: worlds, routes, actors, sensors, recorded as ROS bags with their truth."""

@@ -1,0 +1,85 @@
+"""From a campaign to its world: the static scene, the car's motion and the traffic."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lifelong_slam.simulation.actors import Actor, make_actors
+from lifelong_slam.simulation.campaign import Campaign, Segment
+from lifelong_slam.simulation.highway import highway_site, ramp_site
+from lifelong_slam.simulation.mesh import Mesh
+from lifelong_slam.simulation.motion import VehicleMotion
+from lifelong_slam.simulation.routes import Path
+from lifelong_slam.simulation.site import Site
+from lifelong_slam.simulation.terrain import Terrain
+from lifelong_slam.simulation.urban import junction_turns, urban_site
+
+_SLOPES = {"urban": 0.012, "highway": 0.012, "ramp": 0.018}
+_BEFORE = {"urban": 60.0, "highway": 120.0, "ramp": 60.0}  # metres of road behind the start
+_AFTER = {"urban": 130.0, "highway": 280.0, "ramp": 220.0}  # metres of road beyond the end
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """All that sensors can see, and how the car moves through it.
+
+    Attributes:
+        static: everything that doesn't move.
+        actors: everything that does.
+        motion: of the car.
+        surface_reach: metres up to which the true surface is kept.
+    """
+
+    static: Mesh
+    actors: list[Actor]
+    motion: VehicleMotion
+    surface_reach: float = 120.0
+
+
+def make_world(campaign: Campaign) -> World:
+    """Build the world of a campaign; the same campaign gives the same world."""
+    path = Path(
+        campaign.route,
+        before=0.0 if campaign.closed else _BEFORE[campaign.kind],
+        after=0.0 if campaign.closed else _AFTER[campaign.kind],
+        closed=campaign.closed,
+    )
+    terrain = Terrain(_generator(campaign, "terrain"), slope=_SLOPES[campaign.kind])
+    site, roads = _make_site(campaign, path, terrain)
+    motion = VehicleMotion(
+        path,
+        terrain,
+        distance=path.length * campaign.laps,
+        speed=campaign.speed,
+        wobble=campaign.wobble,
+        rng=_generator(campaign, "motion"),
+    )
+    actors = make_actors(campaign.traffic, roads, terrain, _generator(campaign, "traffic"))
+    return World(site.build(), actors, motion)
+
+
+def _make_site(campaign: Campaign, path: Path, terrain: Terrain) -> tuple[Site, dict[str, Path]]:
+    rng = _generator(campaign, "site")
+    if campaign.kind == "urban":
+        turns = list(junction_turns(_turns(campaign.route)))
+        return urban_site(path, turns, terrain, rng), {"route": path}
+    if campaign.kind == "ramp":
+        return ramp_site(path, terrain, rng)
+    return highway_site(path, terrain, rng), {"route": path}
+
+
+def _turns(route: Sequence[Segment]) -> list[tuple[float, float, float]]:
+    """Return (start, end, degrees) of each turn along the route."""
+    turns, s = [], 0.0
+    for segment in route:
+        if segment.turn is not None:
+            turns.append((s, s + segment.length, segment.turn))
+        s += segment.length
+    return turns
+
+
+def _generator(campaign: Campaign, what: str) -> np.random.Generator:
+    seed = np.random.SeedSequence([campaign.seed, zlib.crc32(what.encode())])
+    return np.random.default_rng(seed)

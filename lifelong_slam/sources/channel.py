@@ -1,0 +1,31 @@
+"""What a recording says about one stream of messages."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a recording: its name, message type in ROS 2 notation, and number of messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """The stream that a salvaged message belongs to.
+
+    Attributes:
+        topic: its topic.
+        msgtype: message type in ROS 2 notation, ``package/msg/Type``.
+        definition: text of the message definition, empty where the file has none.
+        idl: whether the definition is OMG IDL instead of a .msg file.
+        ros1: whether messages are serialised as in ROS 1 instead of CDR.
+    """
+
+    topic: str
+    msgtype: str
+    definition: str
+    idl: bool = False
+    ros1: bool = False

@@ -1,0 +1,120 @@
+"""What every source's scans go through before SLAM: bad input is counted, logged, survived."""
+
+import logging
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import SourceError
+from lifelong_slam.scan import NANOSECONDS, Scan
+
+_log = logging.getLogger(__name__)
+
+EMPTY = "empty"
+REPEATED = "stamp repeated"
+BACKWARDS = "stamp ran back"
+
+GAP_FACTOR = 3.0
+_INTERVALS = 100  # how many of the latest intervals the usual one is the median of
+_MIN_INTERVALS = 5
+
+
+@dataclass(slots=True)
+class InputCounts:
+    """What was read, and what of it was left out.
+
+    Attributes:
+        read: scans that came from the source.
+        used: scans that were passed on.
+        skipped: scans left out, by reason.
+        dropped_points: points left out for coordinates or times that are NaN or infinite.
+        gaps: intervals longer than `GAP_FACTOR` times the usual one.
+    """
+
+    read: int = 0
+    used: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+    dropped_points: int = 0
+    gaps: int = 0
+
+    def summary(self) -> str:
+        """Return one line for the end of a run."""
+        parts = [f"{self.used} of {self.read} scans used"]
+        parts += [f"{count} skipped ({reason})" for reason, count in sorted(self.skipped.items())]
+        if self.dropped_points:
+            parts.append(f"{self.dropped_points} non-finite points dropped")
+        if self.gaps:
+            parts.append(f"{self.gaps} gaps")
+        return ", ".join(parts)
+
+
+def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
+    """Yield scans that are finite, not empty and strictly later than the one before.
+
+    `counts` is kept up to date while scans are drawn. Each kind of trouble is logged as a warning
+    when first met. Gaps in time are only noted: they are for SLAM to handle.
+
+    Raises:
+        SourceError: the source ended and not one scan was usable.
+    """
+    intervals: deque[int] = deque(maxlen=_INTERVALS)
+    last: int | None = None
+    for scan in source:
+        counts.read += 1
+        scan = _finite(scan, counts)
+        if reason := _why_skip(scan, last):
+            counts.skipped[reason] += 1
+            if counts.skipped[reason] == 1:
+                _log.warning("scan %d at %s s skipped: %s", counts.read, _seconds(scan), reason)
+            continue
+        if last is not None:
+            _note_gap(scan, last, intervals, counts)
+        last = scan.stamp
+        counts.used += 1
+        yield scan
+    if counts.used == 0:
+        raise SourceError(f"no usable scans in this recording: {counts.summary()}")
+
+
+def _finite(scan: Scan, counts: InputCounts) -> Scan:
+    """Drop points whose coordinates or times aren't finite, together with their times."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = scan.points.sum() + (0.0 if scan.offsets is None else scan.offsets.sum())
+    if np.isfinite(total):  # one pass over good data instead of three
+        return scan
+    keep: NDArray[np.bool_] = np.asarray(np.isfinite(scan.points).all(axis=1))
+    if scan.offsets is not None:
+        keep &= np.isfinite(scan.offsets)
+    dropped = len(keep) - int(np.count_nonzero(keep))
+    if dropped and not counts.dropped_points:
+        _log.warning("scan %d has %d non-finite points: dropped", counts.read, dropped)
+    counts.dropped_points += dropped
+    offsets = None if scan.offsets is None else scan.offsets[keep]
+    return Scan(scan.stamp, scan.points[keep], offsets)
+
+
+def _why_skip(scan: Scan, last: int | None) -> str | None:
+    if len(scan.points) == 0:
+        return EMPTY
+    if last is not None and scan.stamp <= last:
+        return REPEATED if scan.stamp == last else BACKWARDS
+    return None
+
+
+def _note_gap(scan: Scan, last: int, intervals: deque[int], counts: InputCounts) -> None:
+    interval = scan.stamp - last
+    if len(intervals) >= _MIN_INTERVALS and interval > GAP_FACTOR * float(np.median(intervals)):
+        counts.gaps += 1
+        if counts.gaps == 1:
+            _log.warning(
+                "a gap of %.3f s before the scan at %s s", interval / NANOSECONDS, _seconds(scan)
+            )
+    intervals.append(interval)
+
+
+def _seconds(scan: Scan) -> str:
+    seconds, nanoseconds = divmod(scan.stamp, NANOSECONDS)
+    return f"{seconds}.{nanoseconds:09d}"

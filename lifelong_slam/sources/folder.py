@@ -1,0 +1,113 @@
+"""Scans from a folder of numbered PCD, PLY or BIN files."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import SourceError
+from lifelong_slam.scan import Scan
+from lifelong_slam.sources.cloud_files import SUFFIXES, read_cloud
+from lifelong_slam.sources.natural_order import natural_order
+from lifelong_slam.sources.references import ordered_trajectory
+from lifelong_slam.sources.scan_files import nominal_stamps, read_scans
+from lifelong_slam.sources.text_files import read_poses, read_times
+from lifelong_slam.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
+
+
+class FolderSource:
+    """Scan files in natural order; the sensor's frame is the base."""
+
+    def __init__(self, path: str, times: str | None = None, poses: str | None = None) -> None:
+        """Find the files, and read their times and reference poses.
+
+        Args:
+            path: a folder of .pcd, .ply or .bin files, or a folder around one such.
+            times: a file of seconds, a line a scan; None takes 10 scans a second.
+            poses: reference T_reference_sensor of each scan, KITTI 3x4 or TUM rows. TUM rows carry
+                their stamps: any number of them beside `times`, one a scan without.
+
+        Raises:
+            SourceError: a path is missing, no scans are there, or counts don't match.
+        """
+        self.path = Path(path)
+        self.files = find_scan_files(self.path)
+        own, rows = (None, None) if poses is None else read_poses(Path(poses))
+        if times is not None:
+            self.stamps = read_times(Path(times))
+            _check_count("times", Path(times), len(self.stamps), len(self.files))
+        elif own is not None:
+            _check_count("TUM poses without times", Path(poses or ""), len(own), len(self.files))
+            _log.info("%s: no times given: stamps are those of the poses", self.path)
+            self.stamps = own
+        else:
+            self.stamps = nominal_stamps(len(self.files), str(self.path))
+        if own is None and rows is not None:
+            _check_count("poses", Path(poses or ""), len(rows), len(self.files))
+            own = self.stamps
+        self._reference = None
+        if own is not None and rows is not None:
+            self._reference = ordered_trajectory(own, rows, str(poses))
+
+    def __len__(self) -> int:
+        """Return the number of scan files."""
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[Scan]:
+        """Yield the scans; damaged files are logged, counted and left out.
+
+        Raises:
+            SourceError: not one file could be read.
+        """
+        yield from read_scans(self.files, self.stamps, read_cloud, str(self.path))
+
+    def reference(self) -> Trajectory | None:
+        """Return the poses given beside the scans, or None."""
+        return self._reference
+
+    @property
+    def T_base_sensor(self) -> NDArray[np.float64]:
+        """The (4, 4) identity: files don't say where the sensor sits."""
+        return np.eye(4)
+
+
+def find_scan_files(path: Path) -> list[Path]:
+    """Return a folder's scan files of the most frequent kind in natural order.
+
+    Raises:
+        SourceError: the path is no folder, or no scan files are there.
+    """
+    if not path.exists():
+        raise SourceError(f"no such folder: {path}")
+    if not path.is_dir():
+        raise SourceError(f"{path} is a file: expected a folder of {', '.join(SUFFIXES)} files")
+    files = _scan_files(path)
+    if not files:
+        inner = [folder for folder in sorted(path.iterdir()) if folder.is_dir()]
+        inner = [folder for folder in inner if _scan_files(folder)]
+        if len(inner) != 1:
+            raise SourceError(f"{path} holds no scans: expected {', '.join(SUFFIXES)} files")
+        _log.info("%s: scans taken from its folder %s", path, inner[0].name)
+        files = _scan_files(inner[0])
+    (suffix, count), *others = Counter(file.suffix.lower() for file in files).most_common()
+    if others:
+        _log.warning(
+            "%s: %d %s files read, the %d others left", path, count, suffix, len(files) - count
+        )
+    return sorted((f for f in files if f.suffix.lower() == suffix), key=natural_order)
+
+
+def _scan_files(folder: Path) -> list[Path]:
+    return [f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()]
+
+
+def _check_count(what: str, path: Path, have: int, scans: int) -> None:
+    if have != scans:
+        raise SourceError(
+            f"{path} has {have} {what}, but there are {scans} scans: one each is needed"
+        )

@@ -1,0 +1,96 @@
+"""Decoding of sensor_msgs/PointCloud2 and Livox CustomMsg into points and raw point times."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import SourceError
+from lifelong_slam.sources.point_times import Values, is_time_field
+
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """A decoded cloud.
+
+    Attributes:
+        points: (N, 3) float64 metres, as the message holds them (NaN included).
+        times: raw values (N,) of every field that may hold point times, by field name.
+    """
+
+    points: NDArray[np.float64]
+    times: dict[str, Values]
+
+
+def decode(message: Any) -> Cloud:
+    """Decode a deserialised PointCloud2 of any field layout, byte order and padding.
+
+    Raises:
+        SourceError: there are no x, y, z fields.
+        ValueError: the data don't fit the sizes that the message declares.
+    """
+    names = [field.name for field in message.fields]
+    if missing := [name for name in "xyz" if name not in names]:
+        raise SourceError(
+            f"a cloud without {', '.join(missing)}: it can't be used as a LiDAR scan; "
+            f"its fields are {', '.join(names) or '(none)'}"
+        )
+    records = _records(message, [n for n in names if n in ("x", "y", "z") or is_time_field(n)])
+    points = np.empty((records.size, 3))
+    with np.errstate(invalid="ignore"):  # NaN of unusual bits are for cleaning to drop
+        for axis, name in enumerate("xyz"):
+            points[:, axis].reshape(records.shape)[...] = records[name]
+    times = {n: records[n].ravel() for n in records.dtype.names or () if n not in ("x", "y", "z")}
+    return Cloud(
+        points, {n: v.astype(v.dtype.newbyteorder("="), copy=False) for n, v in times.items()}
+    )
+
+
+def _records(message: Any, wanted: list[str]) -> NDArray[np.void]:
+    """Return a (height, width) view of the wanted fields in the message's bytes."""
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    dtype = _record_type(message, wanted)
+    data = np.ascontiguousarray(message.data, dtype=np.uint8)
+    row = int(message.row_step)
+    if height <= 1 or (row < width * step and len(data) == height * width * step):
+        row = width * step  # some drivers leave row_step unset
+    needed = (height - 1) * row + width * step if height and width else 0
+    if row < width * step or len(data) < needed:
+        raise ValueError(f"{height} x {width} points of {step} bytes in {len(data)} bytes of data")
+    if needed == 0:
+        return np.empty((0, 0), dtype)
+    return np.ndarray((height, width), dtype, buffer=data.data, strides=(row, step))
+
+
+def _record_type(message: Any, wanted: list[str]) -> np.dtype[np.void]:
+    """Return the structured type of one point with its wanted fields."""
+    order = ">" if message.is_bigendian else "<"
+    fields = {}
+    for field in message.fields:
+        if field.name in wanted and field.datatype in _DATATYPES:
+            kind = np.dtype(order + _DATATYPES[field.datatype])
+            if field.offset + kind.itemsize > message.point_step:
+                raise ValueError(f"field '{field.name}' ends beyond its point")
+            fields[field.name] = (kind, int(field.offset))
+    if unknown := [name for name in "xyz" if name not in fields]:
+        raise ValueError(f"field '{unknown[0]}' has a datatype that PointCloud2 doesn't define")
+    formats = [kind for kind, _ in fields.values()]
+    offsets = [offset for _, offset in fields.values()]
+    return np.dtype(
+        {
+            "names": list(fields),
+            "formats": formats,
+            "offsets": offsets,
+            "itemsize": int(message.point_step),
+        }
+    )
+
+
+def decode_livox(message: Any) -> Cloud:
+    """Decode a deserialised Livox CustomMsg (any of its driver packages); its unit is ns."""
+    points = np.array([(p.x, p.y, p.z) for p in message.points], dtype=np.float64).reshape(-1, 3)
+    times = np.array([p.offset_time for p in message.points], dtype=np.uint32)
+    return Cloud(points, {"offset_time": times})

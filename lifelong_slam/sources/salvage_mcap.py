@@ -1,0 +1,122 @@
+"""Walk through an MCAP file record by record, without its summary."""
+
+import logging
+import struct
+from collections.abc import Iterator
+from io import SEEK_END, BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import zstandard
+from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.typesys.msg import normalize_msgtype
+
+from lifelong_slam.sources.channel import Channel
+
+_log = logging.getLogger(__name__)
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+_CUT = (McapError, struct.error, UnicodeDecodeError, MemoryError)
+
+
+def walk(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
+    """Yield channel, receive time in ns and raw message, as far as records are whole.
+
+    Of a chunk that is cut, the messages before the cut come out too; a chunk that doesn't
+    decompress or fails its checksum is left out with a warning.
+    """
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for record in _records(path):
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, ChannelRecord):
+            channels[record.id] = _channel(record, schemas.get(record.schema_id))
+        elif isinstance(record, Message) and record.channel_id in channels:
+            yield channels[record.channel_id], record.log_time, record.data
+
+
+def _records(path: Path) -> Iterator[McapRecord]:
+    """Yield the records of a file up to where it is cut, those inside chunks as well."""
+    end = len(MAGIC)
+    with path.open("rb") as file:
+        reader = StreamReader(_WholeReads(file), emit_chunks=True)
+        try:
+            for record in reader.records:
+                end = file.tell()
+                if isinstance(record, Chunk):
+                    yield from _inside(record, path)
+                else:
+                    yield record
+        except _CUT as error:
+            _log.debug("%s: end of what is readable: %r", path, error)
+            file.seek(end)
+            yield from _inside_cut_chunk(file)
+
+
+def _inside(chunk: Chunk, path: Path) -> list[McapRecord]:
+    try:
+        return list(breakup_chunk(chunk, validate_crc=True))
+    except Exception as error:  # each compression has its own family of errors
+        _log.warning("%s: a corrupt chunk of %d bytes left out: %s", path, len(chunk.data), error)
+        return []
+
+
+def _inside_cut_chunk(file: BinaryIO) -> Iterator[McapRecord]:
+    """Yield the whole records of a last chunk whose end is missing, if it is a chunk."""
+    stream = ReadDataStream(BytesIO(file.read()))
+    try:
+        opcode, _ = stream.read1(), stream.read8()
+        if opcode != Opcode.CHUNK:
+            return
+        inner = BytesIO(_inflated(Chunk.read(stream)))
+        yield from StreamReader(_WholeReads(inner), skip_magic=True).records
+    except _CUT as error:
+        _log.debug("end of the last chunk: %r", error)
+
+
+def _inflated(chunk: Chunk) -> bytes:
+    """Decompress what is there of a chunk."""
+    try:
+        if chunk.compression == "zstd":
+            return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data))
+        if chunk.compression == "lz4":
+            return bytes(LZ4FrameDecompressor().decompress(chunk.data))
+    except (zstandard.ZstdError, RuntimeError):
+        return b""
+    return bytes(chunk.data)
+
+
+def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:
+    encoding = schema.encoding if schema else ""
+    return Channel(
+        topic=record.topic,
+        msgtype=str(normalize_msgtype(schema.name)) if schema else "",
+        definition=schema.data.decode(errors="replace") if schema else "",
+        idl="idl" in encoding,
+        ros1=record.message_encoding == "ros1",
+    )
+
+
+class _WholeReads:
+    """A file whose last read gives nothing rather than less than what was asked for.
+
+    Lengths come from a damaged file: none larger than the file may lead to an allocation.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = file.seek(0, SEEK_END)
+        file.seek(0)
+
+    def read(self, length: int) -> bytes:
+        """Read exactly `length` bytes, or nothing."""
+        return self._file.read(length) if length <= self._size - self._file.tell() else b""

@@ -1,0 +1,58 @@
+"""A list of scan files with stamps, read one by one: what folder-like sources share."""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import SourceError
+from lifelong_slam.scan import NANOSECONDS, Scan
+from lifelong_slam.sources.assembly import assemble
+from lifelong_slam.sources.pointcloud2 import Cloud
+
+_log = logging.getLogger(__name__)
+
+NOMINAL_RATE = 10  # scans a second where no times are given
+
+
+def nominal_stamps(count: int, where: str) -> NDArray[np.int64]:
+    """Return (count,) stamps at the nominal rate from zero, and say so in the log."""
+    _log.warning("%s: no times given: stamps are nominal, %d scans a second", where, NOMINAL_RATE)
+    return np.arange(count, dtype=np.int64) * (NANOSECONDS // NOMINAL_RATE)
+
+
+def read_scans(
+    files: Sequence[Path],
+    stamps: NDArray[np.int64],
+    read: Callable[[Path], Cloud],
+    where: str,
+) -> Iterator[Scan]:
+    """Yield the scans of the files; damaged ones are logged, counted and left out.
+
+    Raises:
+        SourceError: not one file could be read.
+    """
+    damaged: list[Path] = []
+    yield from assemble(_readable(files, stamps, read, damaged), where)
+    if damaged:
+        _log.warning("%s: %d of %d files left out as damaged", where, len(damaged), len(files))
+    if len(damaged) == len(files):
+        raise SourceError(f"{where}: not one of its {len(files)} scan files can be read")
+
+
+def _readable(
+    files: Sequence[Path],
+    stamps: NDArray[np.int64],
+    read: Callable[[Path], Cloud],
+    damaged: list[Path],
+) -> Iterator[tuple[int, Cloud]]:
+    for path, stamp in zip(files, stamps.tolist(), strict=True):
+        try:
+            cloud = read(path)
+        except (SourceError, OSError) as error:
+            damaged.append(path)
+            _log.warning("scan left out: %s", error)
+            continue
+        yield stamp, cloud
