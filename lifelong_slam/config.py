@@ -1,16 +1,17 @@
 """From a composed config to objects, with errors that name the right key."""
 
+import importlib
 import inspect
 from collections.abc import Mapping
 from typing import Any
 
 from hydra.errors import InstantiationException
-from hydra.utils import get_class, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from lifelong_slam.errors import ConfigError, LifelongSlamError, did_you_mean
+from lifelong_slam.errors import ConfigError, did_you_mean
 
 _CHECKED_TYPES = (bool, int, float, str)
 
@@ -20,56 +21,87 @@ def build(config: DictConfig) -> Any:
 
     Raises:
         ConfigError: a key is unknown or missing, or a value has the wrong type.
-        LifelongSlamError: whatever the target itself raises on purpose.
+        Exception: whatever the target itself raises, as it is.
     """
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        raise ConfigError(str(error).splitlines()[0]) from error
-    _check(plain)
+        raise ConfigError(_missing(error)) from error
     try:
-        return instantiate(plain, _convert_="all")
+        return instantiate(_checked(plain), _convert_="all")
     except InstantiationException as error:
-        if isinstance(error.__cause__, LifelongSlamError):
+        if error.__cause__ is not None:
             raise error.__cause__ from None
-        raise ConfigError(" ".join(str(error).split())) from error
+        raise ConfigError(one_line(error)) from error
 
 
-def _check(node: Any) -> None:
-    """Check every mapping below `node` that has a `_target_`."""
+def _missing(error: OmegaConfBaseException) -> str:
+    key = getattr(error, "full_key", None)
+    if key and "issing mandatory value" in str(error):
+        return f"{key} has no value: give one with {key}=..."
+    return one_line(error)
+
+
+def one_line(error: Exception) -> str:
+    """Return an error's text without line breaks, or its type where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _checked(node: Any) -> Any:
+    """Return a config with each mapping that has a `_target_` checked and its values converted."""
     if isinstance(node, Mapping):
-        if "_target_" in node:
-            _check_arguments(node)
-        for value in node.values():
-            _check(value)
-    elif isinstance(node, list):
-        for value in node:
-            _check(value)
+        plain = {key: _checked(value) for key, value in node.items()}
+        return _checked_arguments(plain) if "_target_" in plain else plain
+    if isinstance(node, list):
+        return [_checked(value) for value in node]
+    return node
 
 
-def _check_arguments(node: Mapping[str, Any]) -> None:
+def _checked_arguments(node: dict[str, Any]) -> dict[str, Any]:
     target = str(node["_target_"])
     try:
-        parameters = inspect.signature(get_class(target), eval_str=True).parameters
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"_target_ {target} can't be loaded: {error}") from error
-    for key, value in node.items():
-        if key.startswith("_"):
-            continue
+        module, _, attribute = target.rpartition(".")
+        called = getattr(importlib.import_module(module), attribute)
+        parameters = dict(inspect.signature(called, eval_str=True).parameters)
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise ConfigError(f"_target_ {target} can't be loaded: {one_line(error)}") from error
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        return node
+    given = {key: value for key, value in node.items() if not key.startswith("_")}
+    _check_keys(_short(target), given, parameters)
+    converted = {
+        key: _converted(f"{_short(target)}: {key}", value, parameters[key].annotation)
+        for key, value in given.items()
+    }
+    return {**node, **converted}
+
+
+def _check_keys(
+    name: str, given: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter]
+) -> None:
+    for key in given:
         if key not in parameters:
             raise ConfigError(
-                f"{target} has no setting '{key}'.{did_you_mean(key, parameters)}"
+                f"{name} has no setting '{key}'.{did_you_mean(key, parameters)}"
                 f" It takes: {', '.join(parameters)}"
             )
-        _check_value(f"{target}: {key}", value, parameters[key].annotation)
+    absent = [k for k, p in parameters.items() if p.default is p.empty and k not in given]
+    if absent:
+        raise ConfigError(f"{name} needs a value for: {', '.join(absent)}")
 
 
-def _check_value(where: str, value: Any, annotation: Any) -> None:
+def _converted(where: str, value: Any, annotation: Any) -> Any:
     """Check plain values (and optional ones) against the annotation of their parameter."""
     kinds = set(getattr(annotation, "__args__", (annotation,)))
     if not kinds <= {*_CHECKED_TYPES, type(None)}:
-        return
+        return value
+    if str in kinds and not kinds & {int, float} and type(value) is int:
+        return str(value)  # a folder may be called 2011
     try:
-        TypeAdapter(annotation).validate_python(value)
+        return TypeAdapter(annotation).validate_python(value)
     except ValidationError as error:
         raise ConfigError(f"{where}: {error.errors()[0]['msg']}, got {value!r}") from error
+
+
+def _short(target: str) -> str:
+    return target.rpartition(".")[2]

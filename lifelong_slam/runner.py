@@ -14,15 +14,19 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import psutil
+from numpy.typing import NDArray
 
-from lifelong_slam.result import SlamResult, StageTimes
+from lifelong_slam.errors import ConfigError
+from lifelong_slam.result import GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
 from lifelong_slam.sources.source import Source
 from lifelong_slam.systems.system import System
+from lifelong_slam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
 _MEGABYTE = 1e6
@@ -79,6 +83,36 @@ class Observer(Protocol):
     def update(self, scan: Scan, times: StageTimes) -> None:
         """Hear of one more processed scan."""
         ...
+
+
+@runtime_checkable
+class Watchable(Protocol):
+    """A system that can be looked into while it runs, for viewers."""
+
+    def watch(self) -> tuple[NDArray[np.float64], GraphSnapshot | None]:
+        """Return the latest T_map_sensor, and the graph if it changed since the last call."""
+        ...
+
+
+class ViewerObserver:
+    """Shows every processed scan to a viewer."""
+
+    def __init__(self, viewer: Viewer, system: System) -> None:
+        """Connect the two.
+
+        Raises:
+            ConfigError: the system can't be looked into.
+        """
+        if not isinstance(system, Watchable):
+            name = type(system).__name__
+            raise ConfigError(f"{name} has no method watch(): run it with viewer=none")
+        self._viewer = viewer
+        self._system = system
+
+    def update(self, scan: Scan, times: StageTimes) -> None:
+        """Show the scan where the system believes it was taken."""
+        T_map_sensor, graph = self._system.watch()
+        self._viewer.update(scan.end_stamp, T_map_sensor, scan.points, graph)
 
 
 class StopRequest:
@@ -174,6 +208,7 @@ def run(
     with ResourceMonitor() as monitor:
         timeline = _feed(clean(source, counts), system, observers, stop, monitor)
         interrupted = stop.requested
+        _log.info("input: %s", counts.summary())
         result = system.finish()
     return RunRecord(
         result=result,

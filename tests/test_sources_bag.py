@@ -23,7 +23,9 @@ from sources_support import (
 
 from lifelong_slam.errors import SourceError, TopicError
 from lifelong_slam.sources.bag import BagSource
-from lifelong_slam.sources.cleaning import InputCounts, clean
+from lifelong_slam.sources.cleaning import UNREADABLE, InputCounts, clean
+from lifelong_slam.sources.livox import decode_livox
+from lifelong_slam.sources.recording import open_recording
 from lifelong_slam.sources.typestores import default_typestore
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -68,6 +70,19 @@ def test_stamps_are_those_of_the_headers_to_the_nanosecond(tmp_path):
     message = cloud_message(xyz(), stamp)
     path = write_bag(tmp_path, "mcap", [("/lidar", CLOUD, stamp + 5 * 10**9, message)])
     assert next(iter(BagSource(str(path)))).stamp == stamp
+
+
+def test_receive_times_stand_in_for_headers_without_stamps(tmp_path, caplog):
+    messages = [("/lidar", CLOUD, START + i, cloud_message(xyz(), 0)) for i in range(3)]
+    source = BagSource(str(write_bag(tmp_path, "db3", messages)))
+    assert [scan.stamp for scan in source] == [START, START + 1, START + 2]
+    assert "receive times used" in caplog.text
+
+
+def test_simulated_time_may_start_at_zero(tmp_path):
+    messages = [("/lidar", CLOUD, START + i, cloud_message(xyz(), i)) for i in range(3)]
+    source = BagSource(str(write_bag(tmp_path, "db3", messages)))
+    assert [scan.stamp for scan in source] == [0, 1, 2]
 
 
 def test_topic_must_be_named_where_there_are_several(tmp_path):
@@ -122,7 +137,9 @@ def test_unreadable_messages_are_counted_and_left_out(tmp_path, caplog):
     for index in (0, 3):
         messages[index][3].width += 1000
     source = BagSource(str(write_bag(tmp_path, "db3", messages)))
-    assert len(list(source)) == 4
+    counts = InputCounts()
+    assert len(list(clean(source, counts))) == 4
+    assert counts.skipped == {UNREADABLE: 2}
     assert source.unreadable == 2
     assert "2 unreadable messages left out" in caplog.text
 
@@ -234,8 +251,9 @@ def test_static_transforms_in_a_circle(tmp_path):
     np.testing.assert_array_equal(source.T_base_sensor, np.eye(4))
 
 
+@pytest.mark.parametrize("frame", ["", "livox", "livox_frame"])
 @pytest.mark.parametrize("kind", ["ros1", "db3", "mcap"])
-def test_livox_messages(tmp_path, kind):
+def test_livox_messages(tmp_path, kind, frame):
     ros1 = kind == "ros1"
     store = default_typestore(ros1)
     name = "livox_ros_driver2/msg/CustomMsg"
@@ -245,7 +263,7 @@ def test_livox_messages(tmp_path, kind):
         for i in range(100)
     ]
     message = store.types[name](
-        header=header(START, ros1),
+        header=header(START, ros1, frame),
         timebase=0,
         point_num=100,
         lidar_id=0,
@@ -253,8 +271,12 @@ def test_livox_messages(tmp_path, kind):
         points=points,
     )
     path = write_bag(tmp_path, kind, [("/livox", name, START, message)], typestore=store)
+    raw = next(open_recording(path).messages("/livox"))[1]
+    with pytest.raises(ValueError, match="points in"):
+        decode_livox(raw[:-1], ros1)
     (scan,) = list(BagSource(str(path)))
-    np.testing.assert_array_equal(scan.points[:, 0], np.arange(100))
+    assert scan.stamp == START
+    np.testing.assert_array_equal(scan.points, [[i, 1.0, 2.0] for i in range(100)])
     np.testing.assert_allclose(scan.offsets, np.arange(100) / 1000)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import Scan
-from lifelong_slam.sources.cleaning import BACKWARDS, EMPTY, REPEATED, InputCounts, clean
+from lifelong_slam.sources.cleaning import AHEAD, BACKWARDS, EMPTY, REPEATED, InputCounts, clean
 
 PERIOD = 100_000_000
 
@@ -70,6 +70,21 @@ def test_empty_repeated_and_backward_scans_are_counted(caplog):
     assert (counts.read, counts.used) == (9, 4)
     assert len([r for r in caplog.records if "skipped" in r.message]) == 3
     assert "2 skipped (empty)" in counts.summary()
+
+
+@pytest.mark.parametrize("position", [0, 3])
+def test_one_stamp_far_ahead_does_not_cost_the_rest(position):
+    scans = [scan(i) for i in range(8)]
+    scans.insert(position, scan(10_000))
+    out, counts = run(scans)
+    assert [s.stamp // PERIOD for s in out] == list(range(8))
+    assert counts.skipped == {AHEAD: 1}
+
+
+def test_a_clock_set_back_for_good_ends_the_use():
+    out, counts = run([scan(i) for i in (1000, 1001, 1002, 0, 1, 2)])
+    assert [s.stamp // PERIOD for s in out] == [1000, 1001, 1002]
+    assert counts.skipped == {BACKWARDS: 3}
 
 
 def test_gaps_are_noted_not_mended(caplog):

@@ -232,13 +232,12 @@ def test_empty_pcd_is_an_empty_scan(tmp_path):
     assert [len(scan.points) for scan in FolderSource(str(tmp_path))] == [0]
 
 
-def test_pcd_without_z(tmp_path, caplog):
+def test_pcd_without_z(tmp_path):
     (tmp_path / "0.pcd").write_text(
         "VERSION 0.7\nFIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA ascii\n1 2\n"
     )
-    with pytest.raises(SourceError, match="not one of its 1 scan files"):
+    with pytest.raises(SourceError, match=r"not one of its 1 .* has no z; its fields: x, y"):
         list(FolderSource(str(tmp_path)))
-    assert "has no z; its fields: x, y" in caplog.text
 
 
 @pytest.mark.parametrize("order", ["<", ">", "="])

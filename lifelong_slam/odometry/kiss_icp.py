@@ -7,7 +7,8 @@ What is ours is how they are driven:
   and a sweep is deskewed by its own duration (a sensor cropped to 120 degrees takes a third of its
   period; KISS-ICP would spread the whole period's motion over it);
 - the first two scans are registered twice, for the motion and then deskewed by it;
-- motions that the model did not predict are checked (`motion_check`).
+- motions that the model did not predict are checked (`motion_check`);
+- each answer is refined against surfaces, which yields its covariance (`surface_refinement`).
 """
 
 import logging
@@ -26,6 +27,8 @@ from numpy.typing import NDArray
 from lifelong_slam.geometry import exp, invert, log
 from lifelong_slam.odometry.motion_check import MotionCheck
 from lifelong_slam.odometry.odometry import OdometryEstimate
+from lifelong_slam.odometry.surface_refinement import SurfaceRefinement
+from lifelong_slam.registration import Cloud
 from lifelong_slam.scan import NANOSECONDS, Scan
 
 Array = NDArray[np.float64]
@@ -43,7 +46,7 @@ class KissIcpOdometry:
         min_range: float,
         max_range: float,
         max_points_per_voxel: int = 20,
-        convergence_criterion: float = 1e-3,
+        convergence_criterion: float = 1e-2,
     ) -> None:
         """Set up.
 
@@ -52,8 +55,8 @@ class KissIcpOdometry:
             min_range: points nearer than this are dropped, metres.
             max_range: points further away are dropped, metres.
             max_points_per_voxel: density of the local map.
-            convergence_criterion: norm of the last step at which ICP stops. KISS-ICP's own 1e-4
-                spends a fifth of its time on tenths of a millimetre.
+            convergence_criterion: norm of the last step at which ICP stops; KISS-ICP's own 1e-4 is
+                spent better on the refinement that follows.
         """
         config = KISSConfig(
             data=DataConfig(min_range=min_range, max_range=max_range, deskew=True),
@@ -66,7 +69,9 @@ class KissIcpOdometry:
             adaptive_threshold=AdaptiveThresholdConfig(),
         )
         self._kiss = KissICP(config)
+        self._voxel_size = voxel_size
         self._check = MotionCheck(voxel_size)
+        self._refinement = SurfaceRefinement(voxel_size)
         self._velocity = np.zeros(6)  # tangent of T_last_next a second
         self._last: OdometryEstimate | None = None
         self._first_scan: Scan | None = None
@@ -76,44 +81,63 @@ class KissIcpOdometry:
         """Estimate the pose of a cleaned scan that is newer than all before it."""
         if self._last is None:
             self._first_scan = scan
-            estimate = self._accept(scan, np.eye(4), self._deskew(scan))
+            self._last = self._enter(scan, self._deskew(scan), np.eye(4))
         else:
             if self._first_scan is not None:
-                self._start_over(self._first_scan, scan)
-            estimate = self._track(scan, self._last)
-        self._last = estimate
-        return estimate
+                self._last = self._start_over(self._first_scan, scan)
+                self._first_scan = None
+            self._last = self._track(scan, self._last)
+        return self._last
 
     def _track(self, scan: Scan, last: OdometryEstimate) -> OdometryEstimate:
+        """Predict, register, check, refine, enter."""
         interval = (scan.end_stamp - last.stamp) / NANOSECONDS
-        points = self._deskew(scan)
-        source, _ = self._kiss.voxelize(points)
         predicted = last.T_odom_sensor @ exp(self._velocity * interval)
-        sigma = self._kiss.adaptive_threshold.get_threshold()
-        T = self._kiss.registration.align_points_to_map(
-            points=source,
-            voxel_map=self._kiss.local_map,
-            initial_guess=predicted,
-            max_correspondance_distance=3 * sigma,
-            kernel=sigma,
-        )
-        if self._is_gap(interval) or self._check.is_suspicious(predicted, T):
-            T = self._check.resolve(points, last.T_odom_sensor, [T, predicted])
+        points = self._deskew(scan)
+        guess = self._icp(points, predicted)
+        if self._is_gap(interval) or self._check.is_suspicious(predicted, guess):
+            guess = self._check.resolve(points, last.T_odom_sensor, [guess, predicted])
+        estimate = self._enter(scan, points, guess)
+        T = estimate.T_odom_sensor
         self._kiss.adaptive_threshold.update_model_deviation(invert(predicted) @ T)
         self._velocity = log(invert(last.T_odom_sensor) @ T) / interval
-        return self._accept(scan, T, points)
+        return estimate
 
-    def _start_over(self, first: Scan, second: Scan) -> None:
+    def _icp(self, points: Array, guess: Array) -> Array:
+        """Register points to the local map from a guess, as KISS-ICP does."""
+        source, _ = self._kiss.voxelize(points)
+        sigma = self._kiss.adaptive_threshold.get_threshold()
+        return np.asarray(
+            self._kiss.registration.align_points_to_map(
+                points=source,
+                voxel_map=self._kiss.local_map,
+                initial_guess=guess,
+                max_correspondance_distance=3 * sigma,
+                kernel=sigma,
+            )
+        )
+
+    def _enter(self, scan: Scan, points: Array, guess: Array) -> OdometryEstimate:
+        """Refine a registered scan's pose and enter the scan into the maps."""
+        _, downsampled = self._kiss.voxelize(points)
+        cloud = Cloud.prepare(downsampled, self._voxel_size)
+        T, covariance = self._refinement.refine(cloud, guess)
+        self._refinement.insert(cloud, T)
+        self._kiss.local_map.update(downsampled, T)
+        self._check.remember(downsampled, T)
+        return OdometryEstimate(scan.end_stamp, T, covariance, points, cloud)
+
+    def _start_over(self, first: Scan, second: Scan) -> OdometryEstimate:
         """Find the motion between the first two scans, then enter the first one deskewed by it."""
-        self._first_scan = None
         interval = (second.end_stamp - first.end_stamp) / NANOSECONDS
         for _ in range(2):  # as recorded, then freed of the distortion that the first answer implies
             motion = self._check.first_motion(self._deskew(first), self._deskew(second))
             self._velocity = log(motion) / interval
         logger.info("starting at %.1f m/s", np.linalg.norm(self._velocity[3:]))
         self._kiss.local_map.clear()
-        self._check = MotionCheck(self._kiss.config.mapping.voxel_size)
-        self._last = self._accept(first, np.eye(4), self._deskew(first))
+        self._check = MotionCheck(self._voxel_size)
+        self._refinement = SurfaceRefinement(self._voxel_size)
+        return self._enter(first, self._deskew(first), np.eye(4))
 
     def _deskew(self, scan: Scan) -> Array:
         """Crop a scan to range and move its points to the sensor's frame at the sweep's end."""
@@ -121,13 +145,6 @@ class KissIcpOdometry:
         motion = exp(self._velocity * scan.duration) if timed else np.eye(4)
         offsets = scan.offsets if timed and scan.offsets is not None else np.zeros(0)
         return np.asarray(self._kiss.preprocessor.preprocess(scan.points, offsets, motion))
-
-    def _accept(self, scan: Scan, T_odom_sensor: Array, points: Array) -> OdometryEstimate:
-        """Enter a registered scan into the local map."""
-        _, downsampled = self._kiss.voxelize(points)
-        self._kiss.local_map.update(downsampled, T_odom_sensor)
-        self._check.remember(downsampled, T_odom_sensor)
-        return OdometryEstimate(scan.end_stamp, T_odom_sensor, points)
 
     def _is_gap(self, interval: float) -> bool:
         """Tell whether scans are missing, and learn the usual period."""

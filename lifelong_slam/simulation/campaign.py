@@ -3,14 +3,15 @@
 import hashlib
 import json
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.simulation.sensors import make_sensor
 
 # Counts up whenever the same config would give another recording, so that no stale one is read.
-SIMULATION_VERSION = 3
+SIMULATION_VERSION = 5
 
 _DISTANCE_TOLERANCE = 0.005  # of the distance that the route's segments may differ from it
 
@@ -112,7 +113,7 @@ class Campaign(_Data):
     closed: bool = False
     route: tuple[Segment, ...] = Field(min_length=1)
     traffic: tuple[Traffic, ...] = ()
-    crosstalk: dict[str, float] = Field(default_factory=dict)
+    crosstalk: dict[str, Annotated[float, Field(ge=0, le=0.5)]] = Field(default_factory=dict)
     rig: tuple[str, ...] = Field(min_length=1)
     azimuth_steps: dict[str, float] = Field(default_factory=dict)
     wobble: float = Field(0.05, ge=0)
@@ -125,6 +126,10 @@ class Campaign(_Data):
             raise ValueError(f"the route is {length:.2f} m long, not {self.distance} m")
         if self.laps > 1 and not self.closed:
             raise ValueError("only a closed route can have several laps")
+        if self.kind != "ramp" and any(stream.road == "motorway" for stream in self.traffic):
+            raise ValueError("only a world of kind 'ramp' has a 'motorway' for traffic")
+        for name in {*self.rig, *self.crosstalk, *self.azimuth_steps}:
+            make_sensor(name, self.azimuth_steps.get(name))
         return self
 
     @property

@@ -126,8 +126,7 @@ def _delineators(site: Site, road: Road) -> None:
     """Put a post every 25 m on either side, a sign or a call box now and then."""
     rng = site.rng
     for lateral in (road.profile.right - 0.7, road.profile.left + 0.7):
-        s = np.arange(road.path.start + 5, road.path.end, 25.0)
-        xy = road.path.point(s, lateral)
+        xy = road.path.point(np.arange(road.path.start + 5, road.path.end, 25.0), lateral)
         site.add(posts(xy, site.terrain.height(xy), 1.05, 0.06, 0.8))
     for s in np.arange(road.path.start + 15, road.path.end, 45.0).tolist():
         T = site.pose(road, s + rng.uniform(-8, 8), road.profile.right - 2.2)

@@ -44,7 +44,7 @@ class Mesh:
         """(M, 3) unit normals; triangles without area have a normal of zero."""
         doubled = self._doubled()
         length = np.linalg.norm(doubled, axis=1, keepdims=True)
-        return np.divide(doubled, length, out=np.zeros_like(doubled), where=length > 0)
+        return np.asarray(doubled / np.where(length > 0, length, 1.0))
 
     def _doubled(self) -> Array:
         a, b, c = self.triangles.swapaxes(0, 1)

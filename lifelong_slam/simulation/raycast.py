@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -42,18 +43,22 @@ class Caster:
         self._reflectivity = np.append(mesh.reflectivity, 0.0).astype(np.float32)
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            o3d.core.Tensor(corners.reshape(-1, 3)),
-            o3d.core.Tensor(np.arange(3 * len(mesh), dtype=np.uint32).reshape(-1, 3)),
+            o3d.core.Tensor.from_numpy(corners.reshape(-1, 3)),
+            o3d.core.Tensor.from_numpy(np.arange(3 * len(mesh), dtype=np.uint32).reshape(-1, 3)),
         )
 
     def cast(self, rays: Floats) -> tuple[Floats, Floats, Floats]:
         """Cast (N, 6) rays, origin and unit direction; return distance, cosine, reflectivity."""
-        answer = self._scene.cast_rays(o3d.core.Tensor(rays))
+        answer = self.cast_only(rays)
         triangle = answer["primitive_ids"].numpy()
         normal = answer["primitive_normals"].numpy()
         cosine = np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:]))
         last = np.uint32(len(self._reflectivity) - 1)
         return answer["t_hit"].numpy(), cosine, self._reflectivity[np.minimum(triangle, last)]
+
+    def cast_only(self, rays: Floats) -> dict[str, Any]:
+        """Return Open3D's own answer for (N, 6) rays; nothing is looked up."""
+        return dict(self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays)))
 
 
 class SweepCaster:

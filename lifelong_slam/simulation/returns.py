@@ -15,7 +15,7 @@ _MISS_RATE = 0.005  # of beams that return nothing whatever they meet
 _DARK = 0.1  # reflectivity at which `0.6 * reach` is detected half the time
 _SHARPNESS = 2  # of the step from detected to not, over the signal's strength
 _INTENSITY_RANGE = 40.0  # metres at which a white wall's intensity has fallen to half
-_BURST_COLUMNS = (20, 160)  # width of a crosstalk burst, columns of 0.05 degrees
+_BURST_WIDTH = (1.0, 8.0)  # of a crosstalk burst, degrees
 _BURST_SHARE = 0.35  # of the beams in a burst that it hits
 
 
@@ -73,7 +73,9 @@ def measure(
     returned = rng.random(shape, dtype=np.float32) < chance
     label = hits.moving.view(np.uint8)
     if crosstalk > 0:
-        distance, label, struck = _with_crosstalk(distance, label, rng, crosstalk)
+        distance, label, struck = _with_crosstalk(
+            distance, label, rng, crosstalk, sensor.azimuth_step
+        )
         returned |= struck
     nearest, farthest = sensor.kept_range
     returned &= (distance >= nearest) & (distance <= farthest)
@@ -84,7 +86,11 @@ def measure(
 
 
 def _with_crosstalk(
-    distance: Floats, label: NDArray[np.uint8], rng: np.random.Generator, share: float
+    distance: Floats,
+    label: NDArray[np.uint8],
+    rng: np.random.Generator,
+    share: float,
+    azimuth_step: float,
 ) -> tuple[Floats, NDArray[np.uint8], NDArray[np.bool_]]:
     """Overwrite beams with another sensor's pulses, in bursts.
 
@@ -97,13 +103,13 @@ def _with_crosstalk(
     struck = np.zeros(distance.shape, dtype=np.bool_)
     wanted = share * struck.size
     while struck.sum() < wanted * rng.uniform(0.7, 1.3):
-        width = int(rng.integers(*_BURST_COLUMNS))
+        width = int(np.ceil(rng.uniform(*_BURST_WIDTH) / azimuth_step))
         height = int(rng.integers(4, max(rings // 2, 5)))
         left, low = int(rng.integers(0, columns)), int(rng.integers(0, rings))
         block = np.s_[left : left + width, low : low + height]
         part = distance[block]
         chosen = rng.random(part.shape) < _BURST_SHARE
-        drift = rng.uniform(-0.15, 0.15) * np.arange(part.shape[0])
+        drift = rng.uniform(-3, 3) * azimuth_step * np.arange(part.shape[0])
         false_range = rng.uniform(3, 70) + drift[:, None] + rng.normal(0, 0.3, part.shape)
         part[chosen] = false_range[chosen]
         label[block][chosen] = Label.CROSSTALK

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong_slam.simulation.mesh import Array, Mesh, from_grid, merge
+from lifelong_slam.simulation.mesh import Array, Mesh, from_grid, from_quads, merge
 from lifelong_slam.simulation.routes import Path
 from lifelong_slam.simulation.terrain import Terrain
 
@@ -116,7 +116,18 @@ def road_mesh(road: Road, others: Sequence[Road], terrain: Terrain) -> Mesh:
         for i, reflectivity in enumerate(profile.reflectivity.tolist())
     ]
     level = grid - np.array([0, 0, 1]) * (profile.rise + _JOINT)[:, None]
-    return merge([*strips, from_grid(level, ASPHALT, ~keep)])
+    return merge([*strips, from_grid(level, ASPHALT, ~keep), _risers(grid, level, keep)])
+
+
+def _risers(grid: Array, level: Array, keep: NDArray[np.bool_]) -> Mesh:
+    """Return the upright faces where a levelled cell (keep is false) borders one that is not."""
+    u, v = np.nonzero(keep[:, 1:] != keep[:, :-1])
+    v = v + 1
+    along = np.stack([grid[u, v], grid[u + 1, v], level[u + 1, v], level[u, v]], axis=1)
+    u, v = np.nonzero(keep[1:] != keep[:-1])
+    u = u + 1
+    across = np.stack([grid[u, v], grid[u, v + 1], level[u, v + 1], level[u, v]], axis=1)
+    return from_quads(np.concatenate([along, across]), CONCRETE)
 
 
 def _open_cells(grid: Array, road: Road, others: Sequence[Road]) -> NDArray[np.bool_]:

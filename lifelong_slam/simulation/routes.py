@@ -60,15 +60,17 @@ class Path:
 
     def point(self, s: ArrayLike, lateral: ArrayLike = 0.0) -> Array:
         """Return (N, 2) points at (N,) arc lengths, moved left by `lateral` metres."""
-        along = self._wrap(s)
-        offset = np.broadcast_to(np.asarray(lateral, dtype=np.float64), along.shape)
-        moved: Array = self._xy(along) + offset[..., None] * self.normal(along)
-        return moved
+        wrapped = self._wrap(s)
+        within = np.clip(wrapped, self.start, self.end)  # beyond, the end's tangent goes on
+        offset = np.broadcast_to(np.asarray(lateral, dtype=np.float64), within.shape)
+        normal = self.normal(within)
+        tangent = np.stack([normal[..., 1], -normal[..., 0]], axis=-1)
+        beyond = (wrapped - within)[..., None] * tangent
+        return np.asarray(self._xy(within) + beyond + offset[..., None] * normal)
 
     def heading(self, s: ArrayLike) -> Array:
         """Return the (N,) directions of travel in radians (not wrapped within one lap)."""
-        heading: Array = np.asarray(self._heading(self._wrap(s)))
-        return heading
+        return np.asarray(self._heading(np.clip(self._wrap(s), self.start, self.end)))
 
     def normal(self, s: ArrayLike) -> Array:
         """Return (N, 2) unit vectors to the left."""

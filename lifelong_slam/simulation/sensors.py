@@ -62,13 +62,13 @@ class Sensor:
         """(C,) azimuths of the columns in radians, in the order of time."""
         first, last = self.kept_azimuth
         count = round((first - last) / self.azimuth_step)
-        return np.radians(first - (np.arange(count) + 0.5) * self.azimuth_step)
+        return np.asarray(np.radians(first - (np.arange(count) + 0.5) * self.azimuth_step))
 
     @property
     def offsets(self) -> Array:
         """(C,) seconds after the sweep's start at which each column is measured."""
         first, last = np.radians(self.turn)
-        return SWEEP_SECONDS * (first - self.azimuths) / (first - last)
+        return np.asarray(SWEEP_SECONDS * (first - self.azimuths) / (first - last))
 
     @property
     def directions(self) -> Array:
@@ -100,15 +100,13 @@ def make_sensor(name: str, azimuth_step: float | None = None) -> Sensor:
 def _mounted(x: float, y: float, z: float, yaw_deg: float, pitch_deg: float) -> Array:
     c, s = np.cos(np.radians(pitch_deg)), np.sin(np.radians(pitch_deg))
     tilt = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
-    return planar(x, y, z, np.radians(yaw_deg)) @ tilt
+    return np.asarray(planar(x, y, z, np.radians(yaw_deg)) @ tilt)
 
 
 def _vls128(name: str, *, cropped: bool, azimuth_step: float) -> Sensor:
-    rings = np.arange(128)
-    elevations = -25.0 + (rings + 0.5) * 40.0 / 128
-    if cropped:
-        low, high = _CROPPED_ELEVATION
-        rings = rings[(elevations >= low) & (elevations <= high)]
+    elevations = -25.0 + (np.arange(128) + 0.5) * 40.0 / 128
+    low, high = _CROPPED_ELEVATION if cropped else (-25.0, 15.0)
+    rings = np.flatnonzero((elevations >= low) & (elevations <= high))
     return Sensor(
         name=name,
         topic="/velodyne/pointcloud",

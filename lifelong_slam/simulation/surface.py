@@ -36,7 +36,7 @@ def visible_surface(
 
 def _seen_voxels(caster: Caster, rays: Iterable[Floats], reach: float) -> NDArray[np.int64]:
     """Return the sorted keys of the voxels with visible points and of their neighbours."""
-    seen = np.zeros(0, dtype=np.int64)
+    seen: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     for batch in rays:
         distance, _, _ = caster.cast(batch)
         hit = batch[distance < reach]
@@ -44,7 +44,7 @@ def _seen_voxels(caster: Caster, rays: Iterable[Floats], reach: float) -> NDArra
         seen = np.union1d(seen, _keys(points / _VOXEL))
     shifts = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
     steps = shifts @ (1 << (_BITS * np.arange(3, dtype=np.int64)))
-    return np.unique(seen[:, None] + steps)
+    return np.asarray(np.unique(seen[:, None] + steps), dtype=np.int64)
 
 
 def _samples(

@@ -40,6 +40,14 @@ class World:
 
 def make_world(campaign: Campaign) -> World:
     """Build the world of a campaign; the same campaign gives the same world."""
+    path, terrain, motion = make_route(campaign)
+    site, roads = _make_site(campaign, path, terrain)
+    actors = make_actors(campaign.traffic, roads, terrain, _generator(campaign, "traffic"))
+    return World(site.build(), actors, motion)
+
+
+def make_route(campaign: Campaign) -> tuple[Path, Terrain, VehicleMotion]:
+    """Return a campaign's path, the land and how the car drives over it."""
     path = Path(
         campaign.route,
         before=0.0 if campaign.closed else _BEFORE[campaign.kind],
@@ -47,7 +55,6 @@ def make_world(campaign: Campaign) -> World:
         closed=campaign.closed,
     )
     terrain = Terrain(_generator(campaign, "terrain"), slope=_SLOPES[campaign.kind])
-    site, roads = _make_site(campaign, path, terrain)
     motion = VehicleMotion(
         path,
         terrain,
@@ -56,8 +63,7 @@ def make_world(campaign: Campaign) -> World:
         wobble=campaign.wobble,
         rng=_generator(campaign, "motion"),
     )
-    actors = make_actors(campaign.traffic, roads, terrain, _generator(campaign, "traffic"))
-    return World(site.build(), actors, motion)
+    return path, terrain, motion
 
 
 def _make_site(campaign: Campaign, path: Path, terrain: Terrain) -> tuple[Site, dict[str, Path]]:

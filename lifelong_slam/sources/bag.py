@@ -13,16 +13,16 @@ from lifelong_slam.scan import NANOSECONDS, Scan
 from lifelong_slam.sources.assembly import assemble
 from lifelong_slam.sources.bag_reference import REFERENCE_TYPES, read_reference
 from lifelong_slam.sources.channel import Topic
-from lifelong_slam.sources.pointcloud2 import Cloud, decode, decode_livox
+from lifelong_slam.sources.livox import LIVOX_TYPES, decode_livox
+from lifelong_slam.sources.pointcloud2 import Cloud, decode
 from lifelong_slam.sources.recording import Recording, open_recording
 from lifelong_slam.sources.static_frames import BASE_FRAMES, StaticFrames
-from lifelong_slam.sources.typestores import LIVOX_PACKAGES
 from lifelong_slam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
-_LIVOX_TYPES = tuple(f"{package}/msg/CustomMsg" for package in LIVOX_PACKAGES)
-CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", *_LIVOX_TYPES)
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", *LIVOX_TYPES)
 
 
 class BagSource:
@@ -58,8 +58,14 @@ class BagSource:
         if reference_topic is not None:
             _check_topic(topics, reference_topic, REFERENCE_TYPES, "reference", self.path)
         self._count = topics[self.topic].count
+        headers = list(_first_headers(self._recording, self.topic, 2))
+        self._unstamped = bool(headers) and not any(stamp_of(header) for header in headers)
+        if self._unstamped:
+            _log.warning("%s %s: headers hold no stamps: receive times used", path, self.topic)
         self._frames = _static_frames(self._recording)
-        self._base_frame, self._T_base_sensor = self._find_base()
+        self._base_frame, self._T_base_sensor = self._find_base(
+            str(headers[0].frame_id) if headers else ""
+        )
 
     def __len__(self) -> int:
         """Return the number of messages on the topic."""
@@ -95,12 +101,9 @@ class BagSource:
 
     def _clouds(self) -> Iterator[tuple[int, Cloud]]:
         """Yield header stamps and decoded clouds; undecodable messages are counted."""
-        msgtype = self._recording.topics[self.topic].msgtype
-        decoder = decode_livox if msgtype in _LIVOX_TYPES else decode
-        for _, raw in self._recording.messages(self.topic):
+        for receive_time, raw in self._recording.messages(self.topic):
             try:
-                message = self._recording.deserialize(raw, self.topic)
-                cloud = decoder(message)
+                stamp, cloud = self._decode(raw)
             except SourceError as error:
                 raise SourceError(f"{self.path}, topic {self.topic}: {error}") from None
             except Exception as error:  # a damaged message may break its decoder in any way
@@ -108,11 +111,17 @@ class BagSource:
                 if self.unreadable == 1:
                     _log.warning("%s: unreadable message on %s: %s", self.path, self.topic, error)
                 continue
-            yield header_stamp(message), cloud
+            yield (receive_time if self._unstamped else stamp), cloud
 
-    def _find_base(self) -> tuple[str, NDArray[np.float64]]:
-        """Return the name of the base frame and T_base_sensor."""
-        frame = _frame_id(self._recording, self.topic)
+    def _decode(self, raw: bytes) -> tuple[int, Cloud]:
+        topic = self._recording.topics[self.topic]
+        if topic.msgtype in LIVOX_TYPES:
+            return decode_livox(raw, topic.ros1)
+        message = self._recording.deserialize(raw, self.topic)
+        return stamp_of(message.header), decode(message)
+
+    def _find_base(self, frame: str) -> tuple[str, NDArray[np.float64]]:
+        """Return the name of the base frame and T_base_sensor of the sensor's frame."""
         if found := self._frames.T_base(frame):
             return found
         _log.info(
@@ -122,10 +131,9 @@ class BagSource:
         return frame, np.eye(4)
 
 
-def header_stamp(message: Any) -> int:
-    """Return the stamp of a deserialised message's header in integer nanoseconds."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+def stamp_of(header: Any) -> int:
+    """Return a deserialised header's stamp in integer nanoseconds."""
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
 
 
 def _choose_topic(topics: dict[str, Topic], topic: str | None, path: Path) -> str:
@@ -166,20 +174,26 @@ def _listed(topics: Iterable[Topic]) -> str:
 
 def _static_frames(recording: Recording) -> StaticFrames:
     messages = []
-    if "/tf_static" in recording.topics:
-        for _, raw in recording.messages("/tf_static"):
+    for topic in recording.topics.values():
+        if topic.msgtype != _TF_TYPE or not topic.name.endswith("/tf_static"):
+            continue
+        for _, raw in recording.messages(topic.name):
             try:
-                messages.append(recording.deserialize(raw, "/tf_static"))
+                messages.append(recording.deserialize(raw, topic.name))
             except Exception as error:  # a damaged message may break its decoder in any way
-                _log.warning("unreadable message on /tf_static: %s", error)
+                _log.warning("unreadable message on %s: %s", topic.name, error)
     return StaticFrames(messages)
 
 
-def _frame_id(recording: Recording, topic: str) -> str:
-    """Return the frame of the topic's first readable cloud."""
+def _first_headers(recording: Recording, topic: str, count: int) -> Iterator[Any]:
+    """Yield the headers of the first messages that can be decoded."""
     for _, raw in recording.messages(topic):
         try:
-            return str(recording.deserialize(raw, topic).header.frame_id)
+            header = recording.deserialize(raw, topic).header
         except Exception as error:  # a damaged message may break its decoder in any way
             _log.debug("unreadable message on %s: %s", topic, error)
-    return ""
+            continue
+        yield header
+        count -= 1
+        if count == 0:
+            return

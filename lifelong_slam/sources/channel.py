@@ -5,11 +5,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a recording: its name, message type in ROS 2 notation, and number of messages."""
+    """A topic of a recording.
+
+    Attributes:
+        name: its name.
+        msgtype: message type in ROS 2 notation, ``package/msg/Type``.
+        count: number of messages.
+        ros1: whether messages are serialised as in ROS 1 instead of CDR.
+    """
 
     name: str
     msgtype: str
     count: int
+    ros1: bool
 
 
 @dataclass(frozen=True, slots=True)

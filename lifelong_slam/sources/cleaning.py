@@ -16,8 +16,11 @@ _log = logging.getLogger(__name__)
 EMPTY = "empty"
 REPEATED = "stamp repeated"
 BACKWARDS = "stamp ran back"
+AHEAD = "stamp jumped ahead"
+UNREADABLE = "unreadable"
 
 GAP_FACTOR = 3.0
+_JUMP = 10 * NANOSECONDS
 _INTERVALS = 100  # how many of the latest intervals the usual one is the median of
 _MIN_INTERVALS = 5
 
@@ -29,7 +32,8 @@ class InputCounts:
     Attributes:
         read: scans that came from the source.
         used: scans that were passed on.
-        skipped: scans left out, by reason.
+        skipped: scans left out, by reason; those that the source itself could not read among them
+            (from its attribute `unreadable`, where it has one), though they don't count as read.
         dropped_points: points left out for coordinates or times that are NaN or infinite.
         gaps: intervals longer than `GAP_FACTOR` times the usual one.
     """
@@ -60,23 +64,29 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     Raises:
         SourceError: the source ended and not one scan was usable.
     """
+    try:
+        yield from _cleaned(source, counts)
+    finally:
+        if unreadable := getattr(source, "unreadable", 0):
+            counts.skipped[UNREADABLE] = unreadable
+    if counts.used == 0:
+        raise SourceError(f"no usable scans in this recording: {counts.summary()}")
+
+
+def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     intervals: deque[int] = deque(maxlen=_INTERVALS)
     last: int | None = None
-    for scan in source:
+    for scan, after in _with_next(source):
         counts.read += 1
         scan = _finite(scan, counts)
-        if reason := _why_skip(scan, last):
-            counts.skipped[reason] += 1
-            if counts.skipped[reason] == 1:
-                _log.warning("scan %d at %s s skipped: %s", counts.read, _seconds(scan), reason)
+        if reason := _why_skip(scan, last, after):
+            _skip(scan, reason, counts)
             continue
         if last is not None:
             _note_gap(scan, last, intervals, counts)
         last = scan.stamp
         counts.used += 1
         yield scan
-    if counts.used == 0:
-        raise SourceError(f"no usable scans in this recording: {counts.summary()}")
 
 
 def _finite(scan: Scan, counts: InputCounts) -> Scan:
@@ -96,12 +106,32 @@ def _finite(scan: Scan, counts: InputCounts) -> Scan:
     return Scan(scan.stamp, scan.points[keep], offsets)
 
 
-def _why_skip(scan: Scan, last: int | None) -> str | None:
+def _with_next(source: Iterable[Scan]) -> Iterator[tuple[Scan, Scan | None]]:
+    """Yield each scan with the one after it."""
+    scan = None
+    for after in source:
+        if scan is not None:
+            yield scan, after
+        scan = after
+    if scan is not None:
+        yield scan, None
+
+
+def _why_skip(scan: Scan, last: int | None, after: Scan | None) -> str | None:
     if len(scan.points) == 0:
         return EMPTY
     if last is not None and scan.stamp <= last:
         return REPEATED if scan.stamp == last else BACKWARDS
+    if after is not None and scan.stamp - after.stamp > _JUMP:
+        # one wrong stamp far ahead would turn all that follow into scans that ran back
+        return AHEAD if last is None or after.stamp > last else None
     return None
+
+
+def _skip(scan: Scan, reason: str, counts: InputCounts) -> None:
+    counts.skipped[reason] += 1
+    if counts.skipped[reason] == 1:
+        _log.warning("scan %d at %s s skipped: %s", counts.read, _seconds(scan), reason)
 
 
 def _note_gap(scan: Scan, last: int, intervals: deque[int], counts: InputCounts) -> None:

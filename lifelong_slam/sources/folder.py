@@ -37,6 +37,7 @@ class FolderSource:
         """
         self.path = Path(path)
         self.files = find_scan_files(self.path)
+        self._damaged: list[str] = []
         own, rows = (None, None) if poses is None else read_poses(Path(poses))
         if times is not None:
             self.stamps = read_times(Path(times))
@@ -64,7 +65,12 @@ class FolderSource:
         Raises:
             SourceError: not one file could be read.
         """
-        yield from read_scans(self.files, self.stamps, read_cloud, str(self.path))
+        yield from read_scans(self.files, self.stamps, read_cloud, str(self.path), self._damaged)
+
+    @property
+    def unreadable(self) -> int:
+        """Number of damaged files met in the latest pass."""
+        return len(self._damaged)
 
     def reference(self) -> Trajectory | None:
         """Return the poses given beside the scans, or None."""

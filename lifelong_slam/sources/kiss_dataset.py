@@ -47,23 +47,10 @@ class KissDatasetSource:
         Raises:
             SourceError: no such loader or path, a package it needs is missing, or it refuses.
         """
-        from kiss_icp.datasets import available_dataloaders, dataset_factory
-
         self.path = Path(path)
         self.loader = loader
-        known = available_dataloaders()
-        if loader not in known:
-            raise SourceError(
-                f"kiss_icp has no loader '{loader}'.{did_you_mean(loader, known)} "
-                f"It has: {', '.join(known)}"
-            )
-        if not self.path.exists():
-            raise SourceError(f"no such file or folder: {self.path}")
         options = {"sequence": None if sequence is None else str(sequence), "topic": topic}
-        options = {name: value for name, value in options.items() if value is not None}
-        self._dataset = self._guarded(
-            lambda: dataset_factory(dataloader=loader, data_dir=self.path, **options)
-        )
+        self._dataset = self._open({n: v for n, v in options.items() if v is not None})
         self._count = self._guarded(lambda: len(self._dataset))
         self._stamps: dict[int, int] = {}
         self.unreadable = 0
@@ -114,6 +101,21 @@ class KissDatasetSource:
     def T_base_sensor(self) -> NDArray[np.float64]:
         """The (4, 4) identity: loaders don't say where the sensor sits."""
         return np.eye(4)
+
+    def _open(self, options: dict[str, str]) -> Any:
+        from kiss_icp.datasets import available_dataloaders, dataset_factory
+
+        known = available_dataloaders()
+        if self.loader not in known:
+            raise SourceError(
+                f"kiss_icp has no loader '{self.loader}'.{did_you_mean(self.loader, known)} "
+                f"It has: {', '.join(known)}"
+            )
+        if not self.path.exists():
+            raise SourceError(f"no such file or folder: {self.path}")
+        return self._guarded(
+            lambda: dataset_factory(dataloader=self.loader, data_dir=self.path, **options)
+        )
 
     def _scan(self, index: int, points: NDArray[np.float64], times: NDArray[Any]) -> Scan:
         times = times.ravel().astype(np.float64)

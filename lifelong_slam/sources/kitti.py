@@ -49,6 +49,7 @@ class KittiSource:
         self.files = sorted(scans.glob("*.bin"), key=natural_order) if scans else []
         if not self.files:
             raise SourceError(f"{scans} holds no .bin scans")
+        self._damaged: list[str] = []
         self._rows = _row_numbers(self.files)
         self.stamps = self._read_stamps()
 
@@ -62,7 +63,12 @@ class KittiSource:
         Raises:
             SourceError: not one file could be read.
         """
-        yield from read_scans(self.files, self.stamps, _read_cloud, str(self.folder))
+        yield from read_scans(self.files, self.stamps, _read_cloud, str(self.folder), self._damaged)
+
+    @property
+    def unreadable(self) -> int:
+        """Number of damaged files met in the latest pass."""
+        return len(self._damaged)
 
     def reference(self) -> Trajectory | None:
         """Return T_reference_sensor of the benchmark's poses, carried from camera to LiDAR.

@@ -77,7 +77,7 @@ class Encoding:
         """Return (N,) seconds from `stamp` of (N,) raw values; "sweep" counts from the least."""
         if len(values) == 0:
             return np.empty(0)
-        zero = {"header": 0, "epoch": stamp, "sweep": _least(values) * self.unit}[self.origin]
+        zero = self._zero(values, stamp)
         if np.issubdtype(values.dtype, np.integer):  # exact: no float holds epoch nanoseconds
             counts = values.astype(np.int64) - int(zero // self.unit)
             nanoseconds = (counts * self.unit - int(zero % self.unit)).astype(np.float64)
@@ -85,10 +85,14 @@ class Encoding:
             nanoseconds = (values.astype(np.float64) - zero / self.unit) * self.unit
         return nanoseconds / NANOSECONDS
 
-
-def _least(values: Values) -> int | float:
-    least = np.nanmin(values)
-    return int(least) if np.issubdtype(values.dtype, np.integer) else float(least)
+    def _zero(self, values: Values, stamp: int) -> int | float:
+        """Return the nanoseconds, on the field's clock, that are offset zero."""
+        if self.origin == "header":
+            return 0
+        if self.origin == "epoch":
+            return stamp
+        whole = np.issubdtype(values.dtype, np.integer)
+        return (int(values.min()) if whole else float(np.nanmin(values))) * self.unit
 
 
 def is_time_field(name: str) -> bool:

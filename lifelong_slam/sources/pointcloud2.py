@@ -1,4 +1,4 @@
-"""Decoding of sensor_msgs/PointCloud2 and Livox CustomMsg into points and raw point times."""
+"""Decoding of sensor_msgs/PointCloud2 into points and raw point times."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -87,10 +87,3 @@ def _record_type(message: Any, wanted: list[str]) -> np.dtype[np.void]:
             "itemsize": int(message.point_step),
         }
     )
-
-
-def decode_livox(message: Any) -> Cloud:
-    """Decode a deserialised Livox CustomMsg (any of its driver packages); its unit is ns."""
-    points = np.array([(p.x, p.y, p.z) for p in message.points], dtype=np.float64).reshape(-1, 3)
-    times = np.array([p.offset_time for p in message.points], dtype=np.uint32)
-    return Cloud(points, {"offset_time": times})

@@ -54,7 +54,7 @@ class IndexedRecording:
         with self._open() as reader:
             self._store = reader.typestore
             self._topics = {
-                name: Topic(name, info.msgtype or "several types", info.msgcount)
+                name: Topic(name, info.msgtype or "several types", info.msgcount, self._ros1)
                 for name, info in reader.topics.items()
             }
 
@@ -113,7 +113,7 @@ def open_recording(path: Path) -> Recording:
     if count == 0:
         raise SourceError(f"{path} is damaged and no message in it is whole: {reason}")
     _log.warning(
-        "%s is cut short or damaged (%s): %d whole messages on %d topics are used",
+        "%s is cut short or damaged, or has no index (%s): %d whole messages on %d topics are used",
         *(path, reason, count, len(salvaged.topics)),
     )
     return salvaged

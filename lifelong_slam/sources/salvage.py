@@ -42,7 +42,7 @@ class SalvagedRecording:
     def topics(self) -> Mapping[str, Topic]:
         """The topics that have a whole message, by name."""
         return {
-            name: Topic(name, channel.msgtype, self._counts[name])
+            name: Topic(name, channel.msgtype, self._counts[name], channel.ros1)
             for name, channel in self._channels.items()
         }
 

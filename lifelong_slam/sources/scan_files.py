@@ -28,31 +28,34 @@ def read_scans(
     stamps: NDArray[np.int64],
     read: Callable[[Path], Cloud],
     where: str,
+    damaged: list[str],
 ) -> Iterator[Scan]:
-    """Yield the scans of the files; damaged ones are logged, counted and left out.
+    """Yield the scans of the files; damaged ones are logged, listed in `damaged` and left out.
 
     Raises:
         SourceError: not one file could be read.
     """
-    damaged: list[Path] = []
+    damaged.clear()
     yield from assemble(_readable(files, stamps, read, damaged), where)
     if damaged:
         _log.warning("%s: %d of %d files left out as damaged", where, len(damaged), len(files))
     if len(damaged) == len(files):
-        raise SourceError(f"{where}: not one of its {len(files)} scan files can be read")
+        raise SourceError(
+            f"{where}: not one of its {len(files)} scan files can be read; first: {damaged[0]}"
+        )
 
 
 def _readable(
     files: Sequence[Path],
     stamps: NDArray[np.int64],
     read: Callable[[Path], Cloud],
-    damaged: list[Path],
+    damaged: list[str],
 ) -> Iterator[tuple[int, Cloud]]:
     for path, stamp in zip(files, stamps.tolist(), strict=True):
         try:
             cloud = read(path)
         except (SourceError, OSError) as error:
-            damaged.append(path)
+            damaged.append(str(error))
             _log.warning("scan left out: %s", error)
             continue
         yield stamp, cloud

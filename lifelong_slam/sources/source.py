@@ -15,6 +15,8 @@ class Source(Protocol):
 
     A source yields what the recording holds, NaN points and repeated stamps included;
     `lifelong_slam.sources.cleaning.clean` makes that safe for SLAM, in one place for all sources.
+    What it can't read at all it leaves out and logs; a source may count that in an attribute
+    `unreadable`, which `clean` adds to its own counts.
     """
 
     def __len__(self) -> int:

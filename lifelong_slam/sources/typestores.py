@@ -8,10 +8,9 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from lifelong_slam.sources.channel import Channel
+from lifelong_slam.sources.livox import LIVOX_PACKAGES
 
 _log = logging.getLogger(__name__)
-
-LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 
 _LIVOX_POINT = """
 uint32 offset_time

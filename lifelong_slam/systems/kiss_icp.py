@@ -69,6 +69,10 @@ class KissIcpSystem:
             odometry_ms=1e3 * elapsed, vertices=len(self._poses), edges=len(self._poses) - 1
         )
 
+    def watch(self) -> tuple[Array, None]:
+        """Return the latest T_map_sensor; the graph is but the path."""
+        return self._poses[-1], None
+
     def finish(self) -> SlamResult:
         """Return the odometry's poses and the points they put together."""
         poses = np.array(self._poses).reshape(-1, 4, 4)

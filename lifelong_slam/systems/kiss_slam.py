@@ -63,6 +63,7 @@ class KissSlamSystem:
         self._pieces = None if map_voxel_size is None else _Pieces(map_voxel_size)
         self._watch = _OdometryWatch(self._slam.odometry)
         self._stamps: list[int] = []
+        self._edges_watched = 0
 
     def process(self, scan: Scan) -> StageTimes:
         """Take in one scan; a local map that is full is closed and compared with the others."""
@@ -81,25 +82,34 @@ class KissSlamSystem:
             edges=len(self._edges),
         )
 
+    def watch(self) -> tuple[Array, GraphSnapshot | None]:
+        """Return the latest T_map_sensor, and the graph of local maps if it grew."""
+        T_map_sensor = self._slam.local_map_graph.last_keypose @ self._slam.odometry.last_pose
+        grown = len(self._edges) > self._edges_watched
+        self._edges_watched = len(self._edges)
+        return T_map_sensor, self._graph() if grown else None
+
     def finish(self) -> SlamResult:
         """Close the last local map and optimise every pose, as the package's own pipeline does."""
-        if not self._stamps:
-            return SlamResult(_trajectory([], []), np.empty((0, 3), np.float32), _empty_graph())
         with _prints_to_log():
             self._slam.generate_new_node()
-            last = self._slam.local_map_graph.last_id
             self._slam.local_map_graph.erase_last_local_map()
             poses = self._final_poses()
-        edges = [edge for edge in self._edges if last not in (edge.source, edge.target)]
-        nodes = self._slam.local_map_graph.local_maps()
-        keyposes = {int(node.id): np.asarray(node.keypose) for node in nodes}
         points = self._pieces.join(poses) if self._pieces else np.empty((0, 3), np.float32)
         return SlamResult(
-            trajectory=_trajectory(self._stamps, poses),
+            trajectory=Trajectory(
+                np.array(self._stamps, dtype=np.int64), np.array(poses).reshape(-1, 4, 4)
+            ),
             map_points=points,
-            graph=GraphSnapshot(keyposes, edges),
+            graph=self._graph(),
             counts={"loops_accepted": len(self._slam.get_closures())},
         )
+
+    def _graph(self) -> GraphSnapshot:
+        nodes = self._slam.local_map_graph.local_maps()
+        poses = {int(node.id): np.array(node.keypose) for node in nodes}
+        edges = [e for e in self._edges if e.source in poses and e.target in poses]
+        return GraphSnapshot(poses, edges)
 
     def _final_poses(self) -> list[Array]:
         if len(self._stamps) == 1:  # a graph without edges crashes the package's optimiser
@@ -215,11 +225,3 @@ def _prints_to_log() -> Iterator[None]:
         yield
     for line in filter(None, map(str.strip, text.getvalue().splitlines())):
         _log.debug(line)
-
-
-def _trajectory(stamps: list[int], poses: list[Array]) -> Trajectory:
-    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
-
-
-def _empty_graph() -> GraphSnapshot:
-    return GraphSnapshot({}, [])

@@ -15,15 +15,14 @@ _SMALLEST_MERGE = 500_000
 class PointMap:
     """Keeps the first point that fell into each voxel.
 
-    Points are gathered and merged once they are half as many as the map holds, so that the work for
-    each point stays the same however large the map is. (KISS-ICP's own hash map tells no more than a
-    million voxels apart by their hash, too few for a map of 20 cm voxels.)
+    Points are gathered and merged once they are half as many as the map holds, so that the work
+    for each point stays the same however large the map is.
     """
 
     def __init__(self, voxel_size: float) -> None:
         self._voxel_size = voxel_size
         self._keys = np.empty(0, np.int64)
-        self._points = np.empty((0, 3), np.float32)
+        self._points: NDArray[np.float32] = np.empty((0, 3), np.float32)
         self._fresh: list[tuple[NDArray[np.int64], NDArray[np.float32]]] = []
         self._fresh_count = 0
 

@@ -1,0 +1,72 @@
+"""The last step of a registration: from KISS-ICP's point matches to surfaces.
+
+Point-to-point ICP pays for its simplicity where the vertical field of view is narrow: matches slide
+along the rings on the ground, and pitch and height drift. A few iterations of voxelised GICP (Koide
+et al., ICRA 2021) against a Gaussian voxel map of the recent surroundings remove that, and their Hessian
+is the information that the registration really has, which the pose graph needs.
+"""
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from lifelong_slam.geometry import invert, rotation_angle
+from lifelong_slam.registration import Cloud, covariance_of
+
+Array = NDArray[np.float64]
+
+_HORIZON = 60  # insertions for which an unseen voxel is kept
+_CLEAR_CYCLE = 10
+_ITERATIONS = 10
+_INSERT_ROTATION = 0.1  # rad; a narrow sensor sees new surfaces after a turn of 6 degrees
+_MIN_INLIERS = 50  # points on known surfaces without which there is nothing to refine with
+_LOST_SIGMA = 0.5  # voxels; how well an unrefined pose is known
+
+
+class SurfaceRefinement:
+    """Keeps a Gaussian voxel map of the recent surroundings and aligns scans to it."""
+
+    def __init__(self, voxel_size: float) -> None:
+        """Set up an empty map with cells of `voxel_size` metres."""
+        self._voxel_size = voxel_size
+        self._map = small_gicp.GaussianVoxelMap(voxel_size)
+        self._map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
+        self._last_insertion: Array | None = None
+        self.refused = 0
+
+    def refine(self, cloud: Cloud, guess: Array) -> tuple[Array, Array]:
+        """Return the refined (4, 4) pose in the map and its (6, 6) covariance in the cloud's frame.
+
+        Where too little is known, or the answer leaves the guess by more than a voxel, the guess is
+        returned with a covariance that says how coarse it is.
+        """
+        if self._last_insertion is None:
+            return guess, self._coarse_covariance()
+        result = small_gicp.align(
+            self._map,
+            cloud.points,
+            guess,
+            max_correspondence_distance=self._voxel_size,
+            max_iterations=_ITERATIONS,
+            num_threads=1,
+        )
+        T = np.asarray(result.T_target_source)
+        moved = np.linalg.norm(T[:3, 3] - guess[:3, 3])
+        if result.num_inliers < _MIN_INLIERS or not moved < self._voxel_size:
+            self.refused += 1
+            return guess, self._coarse_covariance()
+        return T, covariance_of(np.asarray(result.H), result.error, result.num_inliers)
+
+    def insert(self, cloud: Cloud, T_odom_sensor: Array) -> None:
+        """Enter a registered cloud where the sensor has moved enough to see something new."""
+        if self._last_insertion is not None:
+            motion = invert(self._last_insertion) @ T_odom_sensor
+            near = np.linalg.norm(motion[:3, 3]) < self._voxel_size
+            if near and rotation_angle(motion) < _INSERT_ROTATION:
+                return
+        self._map.insert(cloud.points, T_odom_sensor)
+        self._last_insertion = T_odom_sensor
+
+    def _coarse_covariance(self) -> Array:
+        sigma = _LOST_SIGMA * self._voxel_size
+        return np.diag([sigma**2 / 25] * 3 + [sigma**2] * 3)  # rad: sigma seen over 5 m

@@ -1,0 +1,133 @@
+"""Run a SLAM system on a recording and leave a run folder: `python scripts/run.py --help`.
+
+Exit status: 0 done; 1 a bug; 2 bad input or settings, said in one line on stderr; 130 stopped by
+SIGINT or SIGTERM, with what was mapped until then written (unless it was aborted by a second one).
+"""
+
+import os
+import shutil
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from console import fail, scan_progress, show_results
+from eval.errors import EvalError
+from eval.run import evaluate_run
+from lifelong_slam.config import build
+from lifelong_slam.errors import ConfigError, LifelongSlamError
+from lifelong_slam.overrides import check_overrides
+from lifelong_slam.provenance import describe_run, seed_everything
+from lifelong_slam.run_folder import write_run
+from lifelong_slam.runner import RunRecord, ViewerObserver, run, stop_on_signals
+from lifelong_slam.viewer import StubViewer
+
+CONF = str(Path(__file__).resolve().parent.parent / "conf")
+KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
+BAD_INPUT, INTERRUPTED = 2, 130
+FILES_OF_THE_START = {".hydra", "run.log", "run.rrd"}
+
+
+@hydra.main(config_path=CONF, config_name="config", version_base="1.3")  # type: ignore[untyped-decorator]
+def job(config: DictConfig) -> None:
+    """Do one run, in the folder that Hydra made for it."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        record = slam(config, folder)
+    except KNOWN_ERRORS as error:
+        discard_if_empty(folder)
+        fail(error)
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise  # the sweep's other jobs go on, and the sweep as a whole fails
+        raise SystemExit(BAD_INPUT) from error
+    except KeyboardInterrupt:
+        discard_if_empty(folder)
+        raise
+    if record.interrupted:
+        print("Stopped early: the run folder holds what was mapped until then.", file=sys.stderr)
+        raise SystemExit(INTERRUPTED)
+
+
+def slam(config: DictConfig, folder: Path) -> RunRecord:
+    """Run SLAM, write and evaluate the run folder, show the results."""
+    with stop_on_signals() as stop:
+        seed_everything(config.seed)
+        source, system = build(part(config, "scenario")), build(part(config, "system"))
+        viewer = build(part(config, "viewer"))
+        observers = [] if isinstance(viewer, StubViewer) else [ViewerObserver(viewer, system)]
+        try:
+            with scan_progress(len(source)) as progress:
+                record = run(source, system, [progress, *observers], stop)
+        finally:
+            viewer.close()
+        write_run(folder, record, source.reference(), source.T_base_sensor)
+        metrics = evaluate_run(folder, run_info(config.seed, record))
+        show_results(record, metrics, folder)
+    return record
+
+
+def part(config: DictConfig, group: str) -> DictConfig:
+    """Return the config of a group, which `~group` on the command line may have removed."""
+    node = config.get(group)
+    if not isinstance(node, DictConfig):
+        raise ConfigError(f"nothing is chosen for {group}: give {group}=...")
+    return node
+
+
+def run_info(seed: int, record: RunRecord) -> dict[str, Any]:
+    """Put together section `run` of metrics.json."""
+    hydra_config = HydraConfig.get()
+    return {
+        **describe_run([*hydra_config.overrides.task], seed),
+        "choices": {g: str(c) for g, c in hydra_config.runtime.choices.items() if "/" not in g},
+        "interrupted": record.interrupted,
+        "wall_seconds": record.wall_seconds,
+        "scans_per_second": record.scans_per_second,
+        "peak_rss_mb": record.peak_rss_mb,
+        "cpu_percent": record.cpu_percent,
+        "input": record.counts,
+        "system": record.result.counts,
+    }
+
+
+def discard_if_empty(folder: Path) -> None:
+    """Remove a run folder that holds nothing but what a run starts with."""
+    if folder.is_dir() and {path.name for path in folder.iterdir()} <= FILES_OF_THE_START:
+        shutil.rmtree(folder)
+        with suppress(OSError):
+            folder.parent.rmdir()  # only if it is empty
+
+
+def check_command_line() -> None:
+    """Refuse overrides that don't fit, before Hydra makes any folder."""
+    arguments = get_args_parser().parse_args()
+    if arguments.config_path is None:
+        more = Path(arguments.config_dir) if arguments.config_dir else None
+        check_overrides(Path(CONF), arguments.overrides, arguments.config_name or "config", more)
+
+
+def main() -> int:
+    """Run one job or a sweep, and turn whatever went wrong into one line and an exit status."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # have Hydra raise errors instead of printing them
+    try:
+        check_command_line()
+        job()
+    except KNOWN_ERRORS as error:
+        fail(error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("Aborted.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
