@@ -70,7 +70,7 @@ def _checked_arguments(node: dict[str, Any]) -> dict[str, Any]:
     given = {key: value for key, value in node.items() if not key.startswith("_")}
     _check_keys(_short(target), given, parameters)
     converted = {
-        key: _converted(f"{_short(target)}: {key}", value, parameters[key].annotation)
+        key: check_value(f"{_short(target)}: {key}", value, parameters[key].annotation)
         for key, value in given.items()
     }
     return {**node, **converted}
@@ -90,8 +90,12 @@ def _check_keys(
         raise ConfigError(f"{name} needs a value for: {', '.join(absent)}")
 
 
-def _converted(where: str, value: Any, annotation: Any) -> Any:
-    """Check plain values (and optional ones) against the annotation of their parameter."""
+def check_value(where: str, value: Any, annotation: Any) -> Any:
+    """Return a plain (or optional) value as its annotation wants it; other kinds as they are.
+
+    Raises:
+        ConfigError: it has another type, in words that begin with `where`.
+    """
     kinds = set(getattr(annotation, "__args__", (annotation,)))
     if not kinds <= {*_CHECKED_TYPES, type(None)}:
         return value

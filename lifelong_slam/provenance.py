@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import psutil
 
+from lifelong_slam.errors import ConfigError
+
 PACKAGES = (
     "lifelong-slam",
     "evo",
@@ -38,7 +40,7 @@ def describe_run(overrides: Sequence[str], seed: int) -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: version for name in PACKAGES if (version := _version(name))},
         "machine": {
-            "system": f"{platform.system()} {platform.release()}",
+            "system": f"{platform.system()} {platform.machine()}",
             "cpu": _cpu_model(),
             "cores": os.cpu_count(),
             "memory_gb": round(psutil.virtual_memory().total / 1e9, 1),
@@ -47,7 +49,13 @@ def describe_run(overrides: Sequence[str], seed: int) -> dict[str, Any]:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed the generators that this package and those it calls draw from."""
+    """Seed the generators that this package and those it calls draw from.
+
+    Raises:
+        ConfigError: the seed isn't one that they all take.
+    """
+    if not 0 <= seed < 2**31:
+        raise ConfigError(f"seed must lie between 0 and {2**31 - 1}, not {seed}")
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - others' code may use the global generator
     import open3d

@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 
 CORRELATED_POINTS = 30.0  # points that share one error (see docs/covariance.md for the measurement)
 SURFACE_REACH = 1.0  # metres within which a target point vouches for its plane
-SURFACE_THICKNESS = 0.1  # metres off the plane that still count as on it: sensor noise and roughness
+SURFACE_THICKNESS = (
+    0.1  # metres off the plane that still count as on it: sensor noise and roughness
+)
 
 _NEIGHBOURS = 10  # points that a local plane is fitted to
 _COARSE_FACTOR = 4.0  # the first stage accepts correspondences so many times as far away

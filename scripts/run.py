@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from console import fail, scan_progress, show_results
 from eval.errors import EvalError
 from eval.run import evaluate_run
-from lifelong_slam.config import build
+from lifelong_slam.config import build, check_value
 from lifelong_slam.errors import ConfigError, LifelongSlamError
 from lifelong_slam.overrides import check_overrides
 from lifelong_slam.provenance import describe_run, seed_everything
@@ -59,8 +59,9 @@ def job(config: DictConfig) -> None:
 def slam(config: DictConfig, folder: Path) -> RunRecord:
     """Run SLAM, write and evaluate the run folder, show the results."""
     with stop_on_signals() as stop:
-        seed_everything(config.seed)
-        source, system = build(part(config, "scenario")), build(part(config, "system"))
+        seed_everything(check_value("seed", config.seed, int))
+        system = build(part(config, "system"))  # first, since recording a scenario takes a while
+        source = build(part(config, "scenario"))
         viewer = build(part(config, "viewer"))
         observers = [] if isinstance(viewer, StubViewer) else [ViewerObserver(viewer, system)]
         try:
@@ -111,6 +112,8 @@ def check_command_line() -> None:
     arguments = get_args_parser().parse_args()
     if arguments.config_path is None:
         more = Path(arguments.config_dir) if arguments.config_dir else None
+        if more and not more.is_dir():
+            raise ConfigError(f"no such folder of configs: {more}")
         check_overrides(Path(CONF), arguments.overrides, arguments.config_name or "config", more)
 
 
@@ -120,6 +123,9 @@ def main() -> int:
     try:
         check_command_line()
         job()
+    except OSError as error:
+        fail(ConfigError(f"can't make the run folder: {error}; choose one with hydra.run.dir=F"))
+        return BAD_INPUT
     except KNOWN_ERRORS as error:
         fail(error)
         return BAD_INPUT

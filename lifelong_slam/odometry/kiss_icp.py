@@ -34,7 +34,25 @@ from lifelong_slam.scan import NANOSECONDS, Scan
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
+_FORGETTING = 0.05  # weight of the newest scan: a memory of two seconds at 10 Hz
 _GAP = 3.0  # usual periods without a scan, after which the velocity says little
+
+
+class Distortion:
+    """How far the motion within a sweep departs from the constant velocity it is deskewed by.
+
+    A velocity that is off by as much as the prediction turned out to be shifts a sweep's points by
+    up to that deviation, their mean by half of it. The registration can't see this error, its Hessian
+    says nothing of it, and on a swaying car it is the larger one.
+    """
+
+    def __init__(self) -> None:
+        self.covariance = np.zeros((6, 6))
+
+    def update(self, deviation: Array, swept: float) -> None:
+        """Take in a (6,) deviation from the prediction; `swept` is sweep time over scan interval."""
+        shift = deviation * min(swept, 1.0) / 2
+        self.covariance += _FORGETTING * (np.outer(shift, shift) - self.covariance)
 
 
 class KissIcpOdometry:
@@ -72,6 +90,7 @@ class KissIcpOdometry:
         self._voxel_size = voxel_size
         self._check = MotionCheck(voxel_size)
         self._refinement = SurfaceRefinement(voxel_size)
+        self._distortion = Distortion()
         self._velocity = np.zeros(6)  # tangent of T_last_next a second
         self._last: OdometryEstimate | None = None
         self._first_scan: Scan | None = None
@@ -97,9 +116,14 @@ class KissIcpOdometry:
         guess = self._icp(points, predicted)
         if self._is_gap(interval) or self._check.is_suspicious(predicted, guess):
             guess = self._check.resolve(points, last.T_odom_sensor, [guess, predicted])
-        estimate = self._enter(scan, points, guess)
+        # Deskew anew by the mean of the old and the new velocity: the old one lags behind, the new one
+        # would feed each registration's noise into the next.
+        self._velocity = (self._velocity + log(invert(last.T_odom_sensor) @ guess) / interval) / 2
+        estimate = self._enter(scan, self._deskew(scan), guess)
         T = estimate.T_odom_sensor
-        self._kiss.adaptive_threshold.update_model_deviation(invert(predicted) @ T)
+        deviation = invert(predicted) @ T
+        self._kiss.adaptive_threshold.update_model_deviation(deviation)
+        self._distortion.update(log(deviation), scan.duration / interval)
         self._velocity = log(invert(last.T_odom_sensor) @ T) / interval
         return estimate
 
@@ -125,12 +149,15 @@ class KissIcpOdometry:
         self._refinement.insert(cloud, T)
         self._kiss.local_map.update(downsampled, T)
         self._check.remember(downsampled, T)
+        covariance = covariance + self._distortion.covariance
         return OdometryEstimate(scan.end_stamp, T, covariance, points, cloud)
 
     def _start_over(self, first: Scan, second: Scan) -> OdometryEstimate:
         """Find the motion between the first two scans, then enter the first one deskewed by it."""
         interval = (second.end_stamp - first.end_stamp) / NANOSECONDS
-        for _ in range(2):  # as recorded, then freed of the distortion that the first answer implies
+        for _ in range(
+            2
+        ):  # as recorded, then freed of the distortion that the first answer implies
             motion = self._check.first_motion(self._deskew(first), self._deskew(second))
             self._velocity = log(motion) / interval
         logger.info("starting at %.1f m/s", np.linalg.norm(self._velocity[3:]))

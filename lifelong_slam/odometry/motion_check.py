@@ -22,7 +22,12 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 _RECENT_SCANS = 20  # what a suspicious motion is checked against
-_YAW_GUESSES = (-0.3, -0.15, 0.15, 0.3)  # rad about the vertical; hand-held sensors reach 0.25 a scan
+_YAW_GUESSES = (
+    -0.3,
+    -0.15,
+    0.15,
+    0.3,
+)  # rad about the vertical; hand-held sensors reach 0.25 a scan
 _START_DISTANCES = (1.5, 3.0)  # metres a scan; 3 m at 10 Hz is 108 km/h
 _START_DIRECTIONS = 8
 _MAX_ROTATION = 0.035  # rad (2 degrees) beside the prediction that ICP's basin surely covers

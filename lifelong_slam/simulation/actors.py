@@ -51,17 +51,16 @@ def make_actors(
     rng: np.random.Generator,
 ) -> list[Actor]:
     """Return the actors of all streams; their spacing, speed and shape vary with `rng`."""
-    shapes = {kind: make_vehicle(kind) for kind in {stream.kind for stream in streams}}
     actors = []
     for stream in streams:
-        mesh = shapes[stream.kind]
-        radius = float(np.hypot(*np.abs(mesh.triangles[..., :2]).reshape(-1, 2).max(axis=0)))
         sign = 1.0 if stream.direction == "same" else -1.0
         first = stream.first
         # One speed a stream: nobody runs into the one ahead.
         speed = stream.speed * rng.uniform(0.95, 1.05)
         for _ in range(stream.count):
             lateral = stream.lateral + rng.uniform(-0.15, 0.15)
+            mesh = make_vehicle(stream.kind, rng)
+            radius = float(np.hypot(mesh.triangles[..., 0], mesh.triangles[..., 1]).max())
             actors.append(
                 Actor(mesh, roads[stream.road], terrain, first, sign * speed, lateral, radius)
             )

@@ -11,7 +11,7 @@ from lifelong_slam.errors import ConfigError
 from lifelong_slam.simulation.sensors import make_sensor
 
 # Counts up whenever the same config would give another recording, so that no stale one is read.
-SIMULATION_VERSION = 5
+SIMULATION_VERSION = 7
 
 _DISTANCE_TOLERANCE = 0.005  # of the distance that the route's segments may differ from it
 

@@ -67,16 +67,16 @@ class SweepCaster:
     def __init__(
         self, sensor: Sensor, motion: VehicleMotion, static: Caster, actors: Sequence[Actor]
     ) -> None:
-        self._sensor, self._motion = sensor, motion
-        self._static, self._actors = static, actors
-        self._shapes = {id(actor.mesh): Caster(actor.mesh) for actor in actors}
+        self.sensor, self._motion = sensor, motion
+        self._static = static
+        self._actors = [(actor, Caster(actor.mesh)) for actor in actors]
         self._azimuths, self._offsets = sensor.azimuths, sensor.offsets
         self.offsets = self._offsets.astype(np.float32)
         self.directions = sensor.directions.astype(np.float32)
 
     def rays(self, start: float) -> tuple[Floats, NDArray[np.float64]]:
         """Return a sweep's (C, R, 6) rays in the world and T_world_sensor, (C, 4, 4)."""
-        T = self._motion.poses(start + self._offsets) @ self._sensor.T_base_sensor
+        T = self._motion.poses(start + self._offsets) @ self.sensor.T_base_sensor
         return _rays_from(T, self.directions), T
 
     def cast(self, start: float) -> Hits:
@@ -86,12 +86,17 @@ class SweepCaster:
         found = self._static.cast(rays.reshape(-1, 6))
         distance, cosine, reflectivity = (values.reshape(shape) for values in found)
         hits = Hits(distance, cosine, reflectivity, np.zeros(shape, dtype=np.bool_))
-        for actor in self._actors:
-            self._cast_actor(actor, start, T_world_sensor, hits)
+        for actor, shape_caster in self._actors:
+            self._cast_actor(actor, shape_caster, start, T_world_sensor, hits)
         return hits
 
     def _cast_actor(
-        self, actor: Actor, start: float, T_world_sensor: NDArray[np.float64], hits: Hits
+        self,
+        actor: Actor,
+        caster: Caster,
+        start: float,
+        T_world_sensor: NDArray[np.float64],
+        hits: Hits,
     ) -> None:
         """Let an actor's nearer surfaces replace what the beams of some columns met.
 
@@ -106,7 +111,7 @@ class SweepCaster:
             return
         T_actor_sensor = invert(T_world_actor[columns]) @ T_world_sensor[columns]
         rays = _rays_from(T_actor_sensor, self.directions[columns])
-        found = self._shapes[id(actor.mesh)].cast(rays.reshape(-1, 6))
+        found = caster.cast(rays.reshape(-1, 6))
         distance, cosine, reflectivity = (values.reshape(rays.shape[:2]) for values in found)
         nearer = distance < hits.distance[columns]
         for whole, part in (
@@ -119,7 +124,7 @@ class SweepCaster:
 
     def _near(self, actor: Actor, start: float, position: NDArray[np.float64]) -> bool:
         offset = actor.poses(np.array([start]))[0, :2, 3] - position
-        return bool(np.hypot(*offset) < self._sensor.kept_range[1] + actor.radius)
+        return bool(np.hypot(*offset) < self.sensor.kept_range[1] + actor.radius)
 
     def _facing(
         self,

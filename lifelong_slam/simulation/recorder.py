@@ -3,7 +3,7 @@
 import json
 import logging
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -125,17 +125,19 @@ def _write_truth(
     write_tum(folder / TRUTH_NAME, Trajectory(seconds_to_stamps(t), world.motion.poses(t)))
     step = max(round(_SURFACE_SPACING / campaign.speed / SWEEP_SECONDS), 1)
     one_lap = int(sweep_count(campaign) / campaign.laps)
-    points = visible_surface(
-        world.static,
-        _views(casters, range(0, one_lap, step)),
-        _generator(campaign, "surface"),
-        reach=world.surface_reach,
-    )
+    with _progress_bar() as progress:
+        sweeps = progress.track(range(0, one_lap, step), description="Sampling the true surface")
+        points = visible_surface(
+            world.static,
+            _views(casters, sweeps),
+            _generator(campaign, "surface"),
+            reach=max(caster.sensor.kept_range[1] for caster in casters),
+        )
     write_points_ply(folder / SURFACE_NAME, points)
     write_mesh_ply(folder / WORLD_NAME, world.static.triangles)
 
 
-def _views(casters: list[SweepCaster], sweeps: range) -> Iterator[Floats]:
+def _views(casters: list[SweepCaster], sweeps: Iterable[int]) -> Iterator[Floats]:
     for k in sweeps:
         for caster in casters:
             rays, _ = caster.rays(k * SWEEP_SECONDS)

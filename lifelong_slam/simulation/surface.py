@@ -10,8 +10,10 @@ from lifelong_slam.simulation.raycast import Caster, Floats
 
 _VOXEL = 0.5  # metres; surfaces within one voxel of a visible point count as visible
 _SPACING = 0.08  # metres between points, as a mean over the surface
+_NEAR = 50.0  # metres from a sensor within which the surface is sampled in full
+_FAR_SHARE = 0.1  # of the points beyond that
 _MOST = 4_000_000  # points; more than that are thinned at random
-_CHUNK = 2_000_000  # points sampled at a time
+_CHUNK = 500_000  # points sampled at a time
 _COARSE = 8  # voxels across the blocks that rule triangles out early
 _BITS = 21  # of each voxel index in a key
 
@@ -21,30 +23,46 @@ def visible_surface(
 ) -> NDArray[np.float32]:
     """Sample the parts of `mesh` that rays (N, 6) meet within `reach` metres.
 
+    What is only seen from afar is sampled more thinly: sensors see little of it, too.
+
     Returns:
         (M, 6) points, metres, and the unit normals there.
     """
-    seen = _seen_voxels(Caster(mesh), rays, reach)
+    near, seen = _seen_voxels(Caster(mesh), rays, reach)
     if not len(seen):
         return np.zeros((0, 6), dtype=np.float32)
-    samples = _samples(mesh, seen, rng)
-    points = np.concatenate([part[_among(_keys(part[:, :3] / _VOXEL), seen)] for part in samples])
+    parts = []
+    for part in _samples(mesh, seen, rng):
+        keys = _keys(part[:, :3] / _VOXEL)
+        chosen = _among(keys, near) | (rng.random(len(keys)) < _FAR_SHARE) & _among(keys, seen)
+        parts.append(part[chosen])
+    points = np.concatenate(parts)
     if len(points) > _MOST:
         points = points[np.sort(rng.choice(len(points), _MOST, replace=False))]
     return points
 
 
-def _seen_voxels(caster: Caster, rays: Iterable[Floats], reach: float) -> NDArray[np.int64]:
-    """Return the sorted keys of the voxels with visible points and of their neighbours."""
-    seen: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+def _seen_voxels(
+    caster: Caster, rays: Iterable[Floats], reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the sorted keys of the voxels seen from near, and of all that are seen.
+
+    The neighbours of voxels with visible points count as seen.
+    """
+    near: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+    seen = near
     for batch in rays:
         distance, _, _ = caster.cast(batch)
-        hit = batch[distance < reach]
-        points = hit[:, :3] + hit[:, 3:] * distance[distance < reach, None]
-        seen = np.union1d(seen, _keys(points / _VOXEL))
+        hit, distance = batch[distance < reach], distance[distance < reach]
+        keys = _keys((hit[:, :3] + hit[:, 3:] * distance[:, None]) / _VOXEL)
+        near, seen = np.union1d(near, keys[distance < _NEAR]), np.union1d(seen, keys)
+    return _with_neighbours(near), _with_neighbours(seen)
+
+
+def _with_neighbours(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     shifts = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 3)
     steps = shifts @ (1 << (_BITS * np.arange(3, dtype=np.int64)))
-    return np.asarray(np.unique(seen[:, None] + steps), dtype=np.int64)
+    return np.asarray(np.unique(keys[:, None] + steps), dtype=np.int64)
 
 
 def _samples(
@@ -96,5 +114,7 @@ def _points(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _among(keys: NDArray[np.int64], ordered: NDArray[np.int64]) -> NDArray[np.bool_]:
+    if not len(ordered):
+        return np.zeros(len(keys), dtype=np.bool_)
     place = np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)
     return np.asarray(ordered[place] == keys)

@@ -20,7 +20,7 @@ from lifelong_slam.simulation.routes import Path
 from lifelong_slam.simulation.site import Site, footprint
 from lifelong_slam.simulation.terrain import Terrain
 from lifelong_slam.simulation.vegetation import bush, conifer, hedge, tree
-from lifelong_slam.simulation.vehicles import car, van
+from lifelong_slam.simulation.vehicles import make_vehicle
 
 _STUB = 90.0  # metres of a side street
 _STUB_CLEARANCE = 30.0  # metres that a side street keeps from other roads, away from its junction
@@ -110,10 +110,7 @@ def _park(site: Site, road: Road, side: float) -> None:
         T = site.pose(road, s + rng.normal(0, 0.3), edge - side * rng.uniform(1.02, 1.15), turn)
         if not site.clear_of_others(road, T, _JUNCTION):
             continue
-        shape = (
-            van() if rng.random() < 0.15 else car(rng.uniform(0.88, 1.08), rng.uniform(0.1, 0.8))
-        )
-        site.add(shape, T)
+        site.add(make_vehicle("van" if rng.random() < 0.15 else "car", rng), T)
 
 
 def _build_row(site: Site, road: Road, side: float) -> None:

@@ -12,9 +12,13 @@ from lifelong_slam.simulation.shapes import box, cylinder, disc, extrusion
 _PAINT, _GLASS, _TYRE, _PLATE, _CLOTH = 0.45, 0.05, 0.06, 1.5, 0.4
 
 
-def make_vehicle(kind: str) -> Mesh:
-    """Return a `car`, `van`, `truck` or `cyclist`."""
-    return _SHAPES[kind]()
+def make_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
+    """Return a `car`, `van`, `truck` or `cyclist`; cars and vans vary in size and colour."""
+    return _SHAPES[kind](rng)
+
+
+def _some_car(rng: np.random.Generator) -> Mesh:
+    return car(float(rng.uniform(0.88, 1.08)), float(rng.uniform(0.1, 0.8)))
 
 
 def car(scale: float = 1.0, paint: float = _PAINT) -> Mesh:
@@ -130,9 +134,9 @@ def _ball(centre: ArrayLike, radius: float, reflectivity: float) -> Mesh:
     )
 
 
-_SHAPES: dict[str, Callable[[], Mesh]] = {
-    "car": car,
-    "van": van,
-    "truck": truck,
-    "cyclist": cyclist,
+_SHAPES: dict[str, Callable[[np.random.Generator], Mesh]] = {
+    "car": _some_car,
+    "van": lambda rng: van(float(rng.uniform(0.3, 0.8))),
+    "truck": lambda rng: truck(),
+    "cyclist": lambda rng: cyclist(),
 }

@@ -29,13 +29,11 @@ class World:
         static: everything that doesn't move.
         actors: everything that does.
         motion: of the car.
-        surface_reach: metres up to which the true surface is kept.
     """
 
     static: Mesh
     actors: list[Actor]
     motion: VehicleMotion
-    surface_reach: float = 120.0
 
 
 def make_world(campaign: Campaign) -> World:

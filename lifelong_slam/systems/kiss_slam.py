@@ -174,7 +174,7 @@ def _import_kiss_slam() -> Any:
     except ImportError as error:
         raise ConfigError(
             f"system=kiss_slam needs the kiss-slam package ({error}):"
-            " run `pip install -e .[kiss_slam]` in the project's folder"
+            " run `pip install -e .[kiss-slam]` in the project's folder"
         ) from error
     return kiss_slam
 

@@ -1,0 +1,1 @@
+"""The pose graph: vertices, edges, robust optimisation."""

@@ -1,0 +1,1 @@
+"""Loop closures: candidates by place and by appearance, then verification by registration."""

@@ -1,0 +1,1 @@
+"""Keyframes, submaps and the static map."""
