@@ -2,8 +2,9 @@
 
 import importlib
 import inspect
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -96,15 +97,23 @@ def check_value(where: str, value: Any, annotation: Any) -> Any:
     Raises:
         ConfigError: it has another type, in words that begin with `where`.
     """
-    kinds = set(getattr(annotation, "__args__", (annotation,)))
-    if not kinds <= {*_CHECKED_TYPES, type(None)}:
+    if not _is_plain(annotation):
         return value
-    if str in kinds and not kinds & {int, float} and type(value) is int:
+    if type(value) is int and annotation in (str, str | None):
         return str(value)  # a folder may be called 2011
     try:
         return TypeAdapter(annotation).validate_python(value)
     except ValidationError as error:
         raise ConfigError(f"{where}: {error.errors()[0]['msg']}, got {value!r}") from error
+
+
+def _is_plain(annotation: Any) -> bool:
+    """Tell whether a type is made of numbers, strings and containers of them."""
+    arguments = [a for a in get_args(annotation) if a is not Ellipsis]
+    if not arguments:
+        return annotation in (*_CHECKED_TYPES, type(None))
+    containers = (Union, UnionType, list, dict, tuple, Sequence, Mapping)
+    return get_origin(annotation) in containers and all(map(_is_plain, arguments))
 
 
 def _short(target: str) -> str:

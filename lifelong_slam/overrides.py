@@ -83,10 +83,9 @@ def _check_composes(name: str, lines: list[str]) -> None:
         raise ConfigError(one_line(error)) from error
     except ValueError as error:  # a number where a group's choice belongs
         for override in _parse(lines):
-            if options := _options(override):
-                raise _wrong_choice(
-                    override.key_or_group, str(override.value()), options
-                ) from error
+            value, options = str(override.value()), _options(override)
+            if options and value not in options:
+                raise _wrong_choice(override.key_or_group, value, options) from error
         raise ConfigError(one_line(error)) from error
     for line in lines:
         if line.startswith("+") and not line.lstrip("+").startswith("hydra"):

@@ -18,6 +18,7 @@ from lifelong_slam.simulation.returns import Label
 from lifelong_slam.simulation.sensors import make_sensor
 from lifelong_slam.simulation.source import SimulatedSource, ensure_recorded
 from lifelong_slam.simulation.truth import read_labels
+from lifelong_slam.trajectory import read_tum
 
 TOPICS = {"bosch": "/rbldar/pointcloud", "velodyne": "/velodyne/pointcloud"}
 SETTINGS: dict[str, Any] = {
@@ -319,3 +320,15 @@ def test_other_worlds_record_as_well(tmp_path: Path, kind: str) -> None:
     counts = [len(scan.points) for scan in source]
     assert min(counts) > 0.3 * 30 * 64
     assert counts == np.diff(labels.starts).tolist()
+
+
+@pytest.mark.parametrize(("speed", "sweeps"), [(1.0, 30), (2.05, 15), (2.15, 14)])
+def test_truth_covers_the_whole_distance_and_every_sweep(
+    tmp_path: Path, speed: float, sweeps: int
+) -> None:
+    campaign = tiny(speed=speed)
+    folder = ensure_recorded(campaign, tmp_path)
+    truth = read_tum(folder / "truth.tum")
+    assert len(read_labels(folder, "bosch").stamps) == sweeps
+    assert truth.stamps[-1] >= START_STAMP + sweeps * 10**8
+    assert truth.length == pytest.approx(campaign.distance, abs=0.055 * speed)

@@ -22,7 +22,9 @@ _COLUMNS = 360
 _ROWS = 180
 _MARGIN = 0.5  # metres behind a point that a ray must reach to have looked through it
 _MARGIN_PER_METRE = 0.02
-_SIGHT = 40.0  # metres; further away pixels are wider than what moves
+_SIGHT = 30.0  # metres; further away pixels are wider than what moves
+_STRIDE = 2  # every second keyframe looks; a moving thing is passed by more than one
+_TILE = 10.0  # metres
 _FEW_HITS = 6  # keyframes; what more of them hit stood still
 _MIN_LOOKS_THROUGH = 2
 _CHUNK = 50  # keyframes that are merged at a time; bounds memory
@@ -31,7 +33,7 @@ _KEY_BITS = 21  # a voxel's coordinate; 2^20 voxels of 0.2 m are 210 km
 
 def thin(points: Array, voxel_size: float) -> NDArray[np.float32]:
     """Keep one of the (N, 3) points a voxel."""
-    return voxel_down_sample(points, voxel_size).astype(np.float32)
+    return np.asarray(voxel_down_sample(points, voxel_size), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,17 +101,31 @@ def _looks_through(
 ) -> NDArray[np.int64]:
     """Count for each of (M, 3) map points how many keyframes looked through it."""
     counts = np.zeros(len(points), dtype=np.int64)
-    order = np.argsort(points[:, 0], kind="stable")
-    x = points[order, 0]
-    for keyframe, pose in zip(keyframes, poses, strict=True):
-        low, high = np.searchsorted(x, [pose[0, 3] - _SIGHT, pose[0, 3] + _SIGHT])
-        near = order[low:high]
-        near = near[np.abs(points[near, 1] - pose[1, 3]) < _SIGHT]
+    tiles = _Tiles(points)
+    for keyframe, pose in zip(keyframes[::_STRIDE], poses[::_STRIDE], strict=True):
+        near = tiles.around(pose[:2, 3])
         pixels, ranges = _project(transform(invert(pose), points[near]))
         behind = _range_image(keyframe.points)[pixels]
         through = behind > ranges * (1 + _MARGIN_PER_METRE) + _MARGIN
-        counts[near] += through & np.isfinite(behind)
+        counts[near] += through & np.isfinite(behind) & (ranges < _SIGHT)
     return counts
+
+
+class _Tiles:
+    """(M, 3) points sorted into square tiles, to find those around a place."""
+
+    def __init__(self, points: Array) -> None:
+        cells = np.floor(points[:, :2] / _TILE)
+        self._corners, tile = np.unique(cells, axis=0, return_inverse=True)
+        self._order = np.argsort(tile, kind="stable")
+        self._ends = np.cumsum(np.bincount(tile, minlength=len(self._corners)))
+
+    def around(self, centre: Array) -> NDArray[np.int64]:
+        """Return the indices of points in tiles within sight of an (x, y)."""
+        offset = (self._corners + 0.5) * _TILE - centre
+        near = np.flatnonzero(np.linalg.norm(offset, axis=1) < _SIGHT + _TILE)
+        slices = [self._order[(self._ends[i - 1] if i else 0) : self._ends[i]] for i in near]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *slices])
 
 
 def _range_image(points: NDArray[np.float32]) -> Array:

@@ -91,7 +91,7 @@ class KissIcpOdometry:
         self._check = MotionCheck(voxel_size)
         self._refinement = SurfaceRefinement(voxel_size)
         self._distortion = Distortion()
-        self._velocity = np.zeros(6)  # tangent of T_last_next a second
+        self._velocity: Array = np.zeros(6)  # tangent of T_last_next a second
         self._last: OdometryEstimate | None = None
         self._first_scan: Scan | None = None
         self._period = 0.0

@@ -6,6 +6,9 @@ from lifelong_slam.simulation.mesh import Array, Mesh, from_quads, from_triangle
 from lifelong_slam.simulation.shapes import box
 
 _GLASS, _TILES, _METAL = 0.06, 0.25, 0.4
+# Corners of a cell in order around it, as slices of the breaks in x and in z.
+_LOW, _HIGH = np.s_[:-1], np.s_[1:]
+_CORNERS = ((_LOW, _LOW), (_HIGH, _LOW), (_HIGH, _HIGH), (_LOW, _HIGH))
 _FOUNDATION = 1.5  # metres below ground, so that no gap opens on a slope
 
 
@@ -31,7 +34,7 @@ def _facade(
     rng: np.random.Generator,
     wide: float,
     height: float,
-    window: tuple[float, float],
+    opening: tuple[float, float],
     recess: float,
     wall: float,
 ) -> Mesh:
@@ -39,30 +42,25 @@ def _facade(
     pitch = float(rng.uniform(2.3, 3.6))
     columns = max(int((wide - 1.0) / pitch), 1)
     rows = max(int((height - 0.8) / 3.0), 1)
-    x = _breaks(wide, columns, min(window[0], wide / columns - 0.5)) - wide / 2
-    z = _breaks(height, rows, min(window[1], height / rows - 0.8))
+    x = _breaks(wide, columns, min(opening[0], wide / columns - 0.5)) - wide / 2
+    z = _breaks(height, rows, min(opening[1], height / rows - 0.8))
     z = np.concatenate([[-_FOUNDATION], z])
-    walls, panes, reveals = [], [], []
-    for i in range(len(x) - 1):
-        for j in range(len(z) - 1):
-            # Beyond the first, rows are shifted by one for the foundation.
-            is_window = i % 2 == 1 and j >= 2 and j % 2 == 0
-            cell = np.array(
-                [[x[i], z[j]], [x[i + 1], z[j]], [x[i + 1], z[j + 1]], [x[i], z[j + 1]]]
-            )
-            front = np.stack([cell[:, 0], np.zeros(4), cell[:, 1]], axis=1)
-            if not is_window:
-                walls.append(front)
-                continue
-            back = front + np.array([0, recess, 0])
-            panes.append(back)
-            reveals.append(np.stack([front, np.roll(front, -1, 0), np.roll(back, -1, 0), back], 1))
+    cells = np.stack(
+        [np.stack(np.meshgrid(x[a], z[b], indexing="ij"), axis=-1) for a, b in _CORNERS], axis=2
+    )
+    fronts = np.insert(cells, 1, 0.0, axis=-1)  # the wall is at y = 0
+    # Walls and windows alternate; rows are shifted by one for the foundation.
+    column, row = np.indices(fronts.shape[:2])
+    window_here = (column % 2 == 1) & (row % 2 == 0) & (row >= 2)
+    openings = fronts[window_here]
+    panes = openings + np.array([0, recess, 0])
+    reveals = np.stack([openings, np.roll(openings, -1, 1), np.roll(panes, -1, 1), panes], axis=2)
     sills = [box(p[0] + [-0.05, -recess - 0.08, -0.06], p[1] + [0.05, 0, 0], wall) for p in panes]
     return merge(
         [
-            from_quads(np.array(walls), wall),
-            from_quads(np.array(panes).reshape(-1, 4, 3), _GLASS),
-            from_quads(np.array(reveals).reshape(-1, 4, 3), wall),
+            from_quads(fronts[~window_here], wall),
+            from_quads(panes, _GLASS),
+            from_quads(reveals, wall),
             *sills,
         ]
     )

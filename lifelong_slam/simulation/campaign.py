@@ -11,7 +11,7 @@ from lifelong_slam.errors import ConfigError
 from lifelong_slam.simulation.sensors import make_sensor
 
 # Counts up whenever the same config would give another recording, so that no stale one is read.
-SIMULATION_VERSION = 7
+SIMULATION_VERSION = 8
 
 _DISTANCE_TOLERANCE = 0.005  # of the distance that the route's segments may differ from it
 
@@ -155,4 +155,5 @@ def make_campaign(**settings: Any) -> Campaign:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         prefix = f"scenario.{where}" if where else "scenario"
-        raise ConfigError(f"{prefix}: {first['msg']}") from error
+        message = first["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{prefix}: {message}") from error

@@ -2,15 +2,17 @@
 
 import json
 import logging
-import zlib
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
 
 from lifelong_slam.scan import NANOSECONDS
@@ -27,6 +29,7 @@ from lifelong_slam.simulation.messages import (
 )
 from lifelong_slam.simulation.raycast import Caster, Floats, SweepCaster
 from lifelong_slam.simulation.returns import measure
+from lifelong_slam.simulation.seeds import generator
 from lifelong_slam.simulation.sensors import SWEEP_SECONDS, Sensor, make_sensor
 from lifelong_slam.simulation.surface import visible_surface
 from lifelong_slam.simulation.truth import LabelWriter, write_mesh_ply, write_points_ply
@@ -50,7 +53,7 @@ def record(campaign: Campaign, folder: Path) -> None:
     static = Caster(world.static)
     casters = [SweepCaster(sensor, world.motion, static, world.actors) for sensor in sensors]
     logger.info("recording %s: %d triangles", campaign.name, len(world.static))
-    _write_bag(campaign, world, sensors, casters, folder)
+    _write_bag(campaign, world, casters, folder)
     _write_truth(campaign, world, casters, folder)
     description = {"simulation_version": SIMULATION_VERSION, **campaign.model_dump(mode="json")}
     (folder / "campaign.json").write_text(json.dumps(description, indent=2) + "\n")
@@ -61,59 +64,72 @@ def seconds_to_stamps(t: NDArray[np.float64]) -> NDArray[np.int64]:
     return START_STAMP + np.round(t * NANOSECONDS).astype(np.int64)
 
 
-def _write_bag(
-    campaign: Campaign,
-    world: World,
-    sensors: list[Sensor],
-    casters: list[SweepCaster],
-    folder: Path,
-) -> None:
-    sweeps = sweep_count(campaign)
-    ins = Ins(world.motion, _generator(campaign, "ins"))
+@dataclass(frozen=True, slots=True)
+class _Lidar:
+    """A sensor of the rig with all that recording it needs."""
+
+    sensor: Sensor
+    caster: SweepCaster
+    cloud: Connection
+    labels: LabelWriter
+
+    def record(self, campaign: Campaign, bag: Writer, k: int) -> None:
+        """Write the k-th sweep and its labels."""
+        start = k * SWEEP_SECONDS
+        stamp = int(seconds_to_stamps(np.array([start]))[0])
+        crosstalk = campaign.crosstalk.get(self.sensor.name, 0.0)
+        rng = generator(campaign.seed, self.sensor.name, k)
+        returns = measure(self.caster.cast(start), self.sensor, rng, crosstalk)
+        message = cloud_message(
+            returns, self.sensor, self.caster.directions, self.caster.offsets, stamp, k
+        )
+        # Bags hold the time of receipt, and a sweep is only sent once it is complete.
+        bag.write(self.cloud, stamp + round(SWEEP_SECONDS * NANOSECONDS), message)
+        self.labels.add(stamp, returns.label)
+
+
+def _write_bag(campaign: Campaign, world: World, casters: list[SweepCaster], folder: Path) -> None:
+    sweeps, each = sweep_count(campaign), round(RATE * SWEEP_SECONDS)
+    ins = Ins(world.motion, generator(campaign.seed, "ins"))
     with ExitStack() as stack:
         bag = stack.enter_context(Writer(folder / BAG_NAME))
-        labels = [stack.enter_context(LabelWriter(folder, sensor.name)) for sensor in sensors]
         progress = stack.enter_context(_progress_bar())
-        task = progress.add_task(f"Recording scenario {campaign.name}", total=sweeps)
         tf = bag.add_connection("/tf_static", TF_TYPE, typestore=TYPESTORE, latching=1)
         imar = bag.add_connection("/imar/odom", ODOMETRY_TYPE, typestore=TYPESTORE)
-        clouds = [
-            bag.add_connection(sensor.topic, CLOUD_TYPE, typestore=TYPESTORE) for sensor in sensors
-        ]
-        bag.write(tf, START_STAMP, mounting_message(sensors, START_STAMP))
-        for k in range(sweeps):
-            for stamp, message in _odometry(ins, k, last=k == sweeps - 1):
+        lidars = []
+        for caster in casters:
+            sensor = caster.sensor
+            cloud = bag.add_connection(sensor.topic, CLOUD_TYPE, typestore=TYPESTORE)
+            labels = stack.enter_context(LabelWriter(folder, sensor.name))
+            lidars.append(_Lidar(sensor, caster, cloud, labels))
+        mounting = mounting_message([caster.sensor for caster in casters], START_STAMP)
+        bag.write(tf, START_STAMP, mounting)
+        name = f"Recording scenario {campaign.name}"
+        for k in progress.track(range(sweeps), description=name):
+            for stamp, message in _odometry(ins, range(k * each, (k + 1) * each)):
                 bag.write(imar, stamp, message)
-            start = k * SWEEP_SECONDS
-            stamp = int(seconds_to_stamps(np.array([start]))[0])
-            for sensor, caster, cloud, label in zip(sensors, casters, clouds, labels, strict=True):
-                returns = measure(
-                    caster.cast(start),
-                    sensor,
-                    _generator(campaign, sensor.name, k),
-                    campaign.crosstalk.get(sensor.name, 0.0),
-                )
-                message = cloud_message(
-                    returns, sensor, caster.directions, caster.offsets, stamp, k
-                )
-                # Bags hold the time of receipt, and a sweep is only sent once it is complete.
-                bag.write(cloud, stamp + round(SWEEP_SECONDS * NANOSECONDS), message)
-                label.add(stamp, returns.label)
-            progress.advance(task)
+            for lidar in lidars:
+                lidar.record(campaign, bag, k)
+        for stamp, message in _odometry(ins, range(sweeps * each, _sample_count(campaign))):
+            bag.write(imar, stamp, message)
 
 
 def sweep_count(campaign: Campaign) -> int:
-    """Return how many whole sweeps fit into the campaign."""
-    return int(campaign.duration / SWEEP_SECONDS + 1e-6)
+    """Return how many sweeps fit into the campaign, to the nearest one."""
+    return round(campaign.duration / SWEEP_SECONDS)
 
 
-def _odometry(ins: Ins, sweep: int, *, last: bool) -> Iterator[tuple[int, bytes]]:
-    """Yield stamp and message of the odometry within a sweep; the last one has its end as well."""
-    each = round(RATE * SWEEP_SECONDS)
-    index = np.arange(sweep * each, (sweep + 1) * each + last)
-    t = index / RATE
+def _sample_count(campaign: Campaign) -> int:
+    """Return how many poses are kept: they cover the whole campaign and all of the last sweep."""
+    seconds = max(campaign.duration, sweep_count(campaign) * SWEEP_SECONDS)
+    return math.floor(seconds * RATE + 1e-6) + 1
+
+
+def _odometry(ins: Ins, samples: range) -> Iterator[tuple[int, bytes]]:
+    """Yield stamp and message of the odometry by the number of the sample."""
+    t = np.array(samples) / RATE
     for i, stamp, T, twist in zip(
-        index.tolist(), seconds_to_stamps(t).tolist(), *ins.measure(t), strict=True
+        samples, seconds_to_stamps(t).tolist(), *ins.measure(t), strict=True
     ):
         yield stamp, odometry_message(T, twist, ins.deviations, stamp, i)
 
@@ -121,7 +137,7 @@ def _odometry(ins: Ins, sweep: int, *, last: bool) -> Iterator[tuple[int, bytes]
 def _write_truth(
     campaign: Campaign, world: World, casters: list[SweepCaster], folder: Path
 ) -> None:
-    t = np.arange(round(sweep_count(campaign) * SWEEP_SECONDS * RATE) + 1) / RATE
+    t = np.arange(_sample_count(campaign)) / RATE
     write_tum(folder / TRUTH_NAME, Trajectory(seconds_to_stamps(t), world.motion.poses(t)))
     step = max(round(_SURFACE_SPACING / campaign.speed / SWEEP_SECONDS), 1)
     one_lap = int(sweep_count(campaign) / campaign.laps)
@@ -130,7 +146,7 @@ def _write_truth(
         points = visible_surface(
             world.static,
             _views(casters, sweeps),
-            _generator(campaign, "surface"),
+            generator(campaign.seed, "surface"),
             reach=max(caster.sensor.kept_range[1] for caster in casters),
         )
     write_points_ply(folder / SURFACE_NAME, points)
@@ -142,13 +158,6 @@ def _views(casters: list[SweepCaster], sweeps: Iterable[int]) -> Iterator[Floats
         for caster in casters:
             rays, _ = caster.rays(k * SWEEP_SECONDS)
             yield rays[::_SURFACE_STRIDE].reshape(-1, 6)
-
-
-def _generator(campaign: Campaign, what: str, index: int = 0) -> np.random.Generator:
-    """Return a generator of its own for each use: nothing depends on the order of use."""
-    return np.random.Generator(
-        np.random.SFC64(np.random.SeedSequence([campaign.seed, zlib.crc32(what.encode()), index]))
-    )
 
 
 def _progress_bar() -> Progress:

@@ -1,10 +1,7 @@
 """From a campaign to its world: the static scene, the car's motion and the traffic."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from lifelong_slam.simulation.actors import Actor, make_actors
 from lifelong_slam.simulation.campaign import Campaign, Segment
@@ -12,6 +9,7 @@ from lifelong_slam.simulation.highway import highway_site, ramp_site
 from lifelong_slam.simulation.mesh import Mesh
 from lifelong_slam.simulation.motion import VehicleMotion
 from lifelong_slam.simulation.routes import Path
+from lifelong_slam.simulation.seeds import generator
 from lifelong_slam.simulation.site import Site
 from lifelong_slam.simulation.terrain import Terrain
 from lifelong_slam.simulation.urban import junction_turns, urban_site
@@ -40,7 +38,7 @@ def make_world(campaign: Campaign) -> World:
     """Build the world of a campaign; the same campaign gives the same world."""
     path, terrain, motion = make_route(campaign)
     site, roads = _make_site(campaign, path, terrain)
-    actors = make_actors(campaign.traffic, roads, terrain, _generator(campaign, "traffic"))
+    actors = make_actors(campaign.traffic, roads, terrain, generator(campaign.seed, "traffic"))
     return World(site.build(), actors, motion)
 
 
@@ -52,20 +50,20 @@ def make_route(campaign: Campaign) -> tuple[Path, Terrain, VehicleMotion]:
         after=0.0 if campaign.closed else _AFTER[campaign.kind],
         closed=campaign.closed,
     )
-    terrain = Terrain(_generator(campaign, "terrain"), slope=_SLOPES[campaign.kind])
+    terrain = Terrain(generator(campaign.seed, "terrain"), slope=_SLOPES[campaign.kind])
     motion = VehicleMotion(
         path,
         terrain,
         distance=path.length * campaign.laps,
         speed=campaign.speed,
         wobble=campaign.wobble,
-        rng=_generator(campaign, "motion"),
+        rng=generator(campaign.seed, "motion"),
     )
     return path, terrain, motion
 
 
 def _make_site(campaign: Campaign, path: Path, terrain: Terrain) -> tuple[Site, dict[str, Path]]:
-    rng = _generator(campaign, "site")
+    rng = generator(campaign.seed, "site")
     if campaign.kind == "urban":
         turns = list(junction_turns(_turns(campaign.route)))
         return urban_site(path, turns, terrain, rng), {"route": path}
@@ -82,8 +80,3 @@ def _turns(route: Sequence[Segment]) -> list[tuple[float, float, float]]:
             turns.append((s, s + segment.length, segment.turn))
         s += segment.length
     return turns
-
-
-def _generator(campaign: Campaign, what: str) -> np.random.Generator:
-    seed = np.random.SeedSequence([campaign.seed, zlib.crc32(what.encode())])
-    return np.random.default_rng(seed)

@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 from kiss_icp.config import KISSConfig
-from kiss_icp.config.config import DataConfig, MappingConfig
+from kiss_icp.config.config import DataConfig, MappingConfig, RegistrationConfig
 from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
 
@@ -32,6 +32,7 @@ class KissIcpSystem:
         voxel_size: float,
         deskew: bool = True,
         map_voxel_size: float | None = 0.2,
+        threads: int = 0,
     ) -> None:
         """Set up the odometry.
 
@@ -41,6 +42,8 @@ class KissIcpSystem:
             voxel_size: of KISS-ICP's local map, metres.
             deskew: undo the motion during a sweep where points have times.
             map_voxel_size: of the map that the run leaves behind, metres; None leaves no map.
+            threads: for registration; 0 takes all cores, 1 makes runs repeatable to the last bit.
+                The package keeps to the number that it is first given in a process.
 
         Raises:
             ConfigError: a range or size makes no sense.
@@ -50,6 +53,7 @@ class KissIcpSystem:
             KISSConfig(
                 data=DataConfig(min_range=min_range, max_range=max_range, deskew=deskew),
                 mapping=MappingConfig(voxel_size=voxel_size),
+                registration=RegistrationConfig(max_num_threads=threads),
             )
         )
         self._map = None if map_voxel_size is None else PointMap(map_voxel_size)

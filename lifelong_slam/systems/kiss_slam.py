@@ -44,6 +44,7 @@ class KissSlamSystem:
         voxel_size: float,
         deskew: bool = True,
         map_voxel_size: float | None = 0.2,
+        threads: int = 0,
     ) -> None:
         """Set up the package's own SLAM; the arguments are those of `KissIcpSystem`.
 
@@ -57,6 +58,7 @@ class KissSlamSystem:
         config.odometry.preprocessing.max_range = max_range
         config.odometry.preprocessing.deskew = deskew
         config.odometry.mapping.voxel_size = voxel_size
+        config.odometry.registration.max_num_threads = threads
         self._slam = package.slam.KissSLAM(config)
         self._edges = _record_factors(self._slam)
         _silence_optimiser(self._slam)

@@ -1,0 +1,177 @@
+"""scripts/run.py as a user meets it: a run folder, or one line that says what is wrong."""
+
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_support import write_folder
+
+import run
+from lifelong_slam.trajectory import read_tum
+
+ROOT = Path(__file__).parent.parent
+SYSTEM = ["system=kiss_icp", "sensor=solid_state"]
+FILES = {"trajectory.tum", "trajectory.bag", "map.ply", "map.bag", "pose_graph.g2o"} | {
+    "metrics.json",
+    "timeline.csv",
+    "plots",
+    ".hydra",
+    "run.log",
+}
+
+
+@pytest.fixture
+def cli(tmp_path, monkeypatch, capfd):
+    """Run scripts/run.py's main in an empty folder; return its status, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    logger = logging.getLogger()
+    level, handlers = logger.level, logger.handlers[:]
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["run.py", *map(str, arguments)])
+        try:
+            status = run.main()
+        except SystemExit as end:
+            status = end.code
+        out, err = capfd.readouterr()
+        return status, out, err
+
+    yield call
+    logger.setLevel(level)
+    logger.handlers[:] = handlers
+
+
+def test_leaves_a_whole_run_folder(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 12)
+    status, out, _ = cli(*SYSTEM, "scenario=folder", f"scenario.path={scans}", "seed=5")
+    assert status == 0
+    folder = Path(out.splitlines()[-1].removeprefix("Run folder: "))
+    assert folder.parent == tmp_path / "outputs"
+    assert folder.name.endswith("_folder_solid_state_kiss_icp")
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert len(read_tum(folder / "trajectory.tum")) == 12
+    info = json.loads((folder / "metrics.json").read_text())["run"]
+    assert info["seed"] == 5
+    assert info["command_line"][-1] == "seed=5"
+    assert info["choices"]["system"] == "kiss_icp"
+    assert info["input"]["used"] == 12
+    assert not info["interrupted"]
+    assert str(tmp_path) not in json.dumps(info)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["scenaro=E"], "no setting 'scenaro'. Did you mean 'scenario'"),
+        (["scenario=Z"], "Choices: A, B"),
+        (["sensor=bosh"], "Did you mean 'bosch'"),
+        (["-m", "scenaro=A,B"], "Did you mean 'scenario'"),
+        (["scenario=loop", "scenario.lapps=2"], "Did you mean 'laps'"),
+        (["scenario=loop", "scenario.laps=many"], "laps: .*integer"),
+        (["seed=x"], "seed: .*integer"),
+        (["scenario=bag"], "scenario.path has no value"),
+        (["scenario=bag", "scenario.path=nowhere.bag"], "no such file.*nowhere.bag"),
+        (["scenario=folder", "scenario.path=empty"], "empty holds no scans"),
+        (["~scenario"], "nothing is chosen for scenario"),
+        (["sensor.min_range=90", "scenario=folder", "scenario.path=empty"], "min_range"),
+        (["--config-dir=nowhere"], "no such folder of configs: nowhere"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(cli, tmp_path, arguments, message):
+    (tmp_path / "empty").mkdir()
+    flags = [a for a in arguments if a.startswith("-")]
+    status, out, err = cli(*flags, *SYSTEM, *[a for a in arguments if a not in flags])
+    assert status == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("error: ")
+    assert re.search(message, err)
+    assert {path.name for path in tmp_path.iterdir()} == {"empty"}
+
+
+def test_scans_without_points_leave_nothing(cli, tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for i in range(3):
+        np.full((5, 4), np.nan, np.float32).tofile(scans / f"{i}.bin")
+    status, _, err = cli(*SYSTEM, "scenario=folder", f"scenario.path={scans}")
+    assert status == 2
+    assert "error: no usable scans" in err.splitlines()[-1]
+    assert {path.name for path in tmp_path.iterdir()} == {"scans"}
+
+
+def test_a_run_folder_that_cannot_be_made(cli, tmp_path):
+    (tmp_path / "file").write_text("")
+    status, _, err = cli(*SYSTEM, "hydra.run.dir=file/run", "scenario=folder", "scenario.path=x")
+    assert status == 2
+    assert err.count("\n") == 1
+    assert "can't make the run folder" in err
+    assert "hydra.run.dir" in err
+
+
+def test_a_failed_run_leaves_what_was_in_its_folder(cli, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+    status, _, _ = cli(*SYSTEM, "hydra.run.dir=mine", "scenario=folder", "scenario.path=x")
+    assert status == 2
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+
+
+def test_a_sweep_goes_on_after_a_job_that_failed(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 2)
+    paths = f"scenario.path={tmp_path}/nowhere,{scans}"
+    status, out, err = cli("-m", *SYSTEM, "scenario=folder", paths)
+    assert status == 2
+    assert "error: no such folder" in err
+    folder = Path(out.splitlines()[-1].removeprefix("Run folder: "))
+    assert (folder / "metrics.json").is_file()
+    sweep = folder.parent
+    assert [path.name for path in sweep.iterdir() if path.is_dir()] == [folder.name]
+    assert folder.name.startswith("1_")
+
+
+def test_help_lists_groups_and_examples(cli):
+    status, out, _ = cli("--help")
+    assert status == 0
+    for words in ("scenario: A, B, C", "sensor: bosch", "python scripts/run.py", "Exit status"):
+        assert words in out
+
+
+SIGNALLING = """
+_target_: run_support.SignallingSource
+count: 8
+at: []
+"""
+
+
+@pytest.mark.parametrize(("at", "mapped"), [([3], (3, 4)), ([0], None)])
+def test_ctrl_c(tmp_path, at, mapped):
+    """Once scans flow, Ctrl-C writes what is mapped so far; before, it leaves nothing."""
+    (tmp_path / "conf" / "scenario").mkdir(parents=True)
+    (tmp_path / "conf" / "scenario" / "signalling.yaml").write_text(SIGNALLING)
+    command = [sys.executable, str(ROOT / "scripts" / "run.py"), "--config-dir", "conf", *SYSTEM]
+    done = subprocess.run(
+        [*command, "scenario=signalling", f"scenario.at={at}"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 130
+    if mapped is None:
+        assert done.stderr.splitlines()[-1] == "Aborted."
+        assert {path.name for path in tmp_path.iterdir()} == {"conf"}
+        return
+    assert "Stopped early" in done.stderr
+    (folder,) = (tmp_path / "outputs").iterdir()
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert len(read_tum(folder / "trajectory.tum")) in mapped
+    assert json.loads((folder / "metrics.json").read_text())["run"]["interrupted"]
