@@ -118,7 +118,8 @@ def covariance_of(hessian: Array, error: float, inliers: int) -> Array:
         error: GICP's cost at the solution, half a sum of squared Mahalanobis distances.
         inliers: points in that sum.
     """
-    variance = 2 * error / max(3 * inliers - 6, 1)
+    # With two points or fewer nothing is left to tell the variance by but the model's own 1.
+    variance = 2 * error / (3 * inliers - 6) if inliers > 2 else 1.0
     floor = 1e-9 * np.trace(hessian) * np.eye(6)
     covariance = CORRELATED_POINTS * variance * np.linalg.inv(hessian + floor + 1e-6 * np.eye(6))
     symmetric: Array = (covariance + covariance.T) / 2
@@ -151,10 +152,14 @@ def register(
 
 def refine(target: Cloud, source: Cloud, guess: Array, max_distance: float) -> Registration:
     """Align `source` to `target` from a guess known to be good: the fine stage only."""
+    if len(target) == 0 or len(source) == 0:  # small_gicp reads beyond an empty cloud
+        return Registration(guess, np.zeros((6, 6)), 0.0, 0, 0.0, 0.0, converged=False)
     return _judge(target, source, _gicp(target, source, guess, max_distance, _FINE_ITERATIONS))
 
 
 def _align(target: Cloud, source: Cloud, guess: Array, max_distance: float) -> Registration:
+    if len(target) == 0 or len(source) == 0:
+        return refine(target, source, guess, max_distance)
     coarse = _gicp(target, source, guess, _COARSE_FACTOR * max_distance, _COARSE_ITERATIONS)
     return refine(target, source, coarse.T_target_source, max_distance)
 

@@ -29,9 +29,12 @@ _YAW_GUESSES = (
     0.3,
 )  # rad about the vertical; hand-held sensors reach 0.25 a scan
 _START_DISTANCES = (1.5, 3.0)  # metres a scan; 3 m at 10 Hz is 108 km/h
-_START_DIRECTIONS = 8
+_ALIAS_DISTANCES = (0.75, 1.5)  # metres; windows, columns and fence posts repeat at such steps
+_DIRECTIONS = 8
 _MAX_ROTATION = 0.035  # rad (2 degrees) beside the prediction that ICP's basin surely covers
 _MAX_TRANSLATION = 0.3  # the same in voxels
+_POOR = 0.9  # of the usual overlap, below which a fit is doubted
+_FORGETTING = 0.1  # weight of the newest check in the usual overlap
 _MIN_OVERLAP = 0.4  # below it not even the best guess is an answer
 
 
@@ -46,6 +49,7 @@ class MotionCheck:
         """
         self._voxel_size = voxel_size
         self._recent: deque[tuple[Array, Array]] = deque(maxlen=_RECENT_SCANS)
+        self._usual_overlap = 0.0
         self.checks = 0
 
     def remember(self, points: Array, T_odom_sensor: Array) -> None:
@@ -63,27 +67,27 @@ class MotionCheck:
     def resolve(self, points: Array, T_last: Array, guesses: Sequence[Array]) -> Array:
         """Return the best pose for (N, 3) points, starting from guesses and turns of the last pose.
 
+        A fit that is poorer than usual may be one row of windows off, so shifts are tried as well.
         Falls back on the first guess where nothing fits.
         """
         self.checks += 1
         target = np.vstack([transform(pose, cloud) for cloud, pose in self._recent])
         turns = [T_last @ exp(np.array([0, 0, yaw, 0, 0, 0])) for yaw in _YAW_GUESSES]
         best = self._register(target, points, [*guesses, T_last, *turns])
+        if best.overlap < _POOR * self._usual_overlap:
+            shifts = [best.T_target_source @ shift for shift in _shifts(_ALIAS_DISTANCES)]
+            shifted = self._register(target, points, shifts)
+            best = max(best, shifted, key=lambda registration: registration.overlap)
+        self._usual_overlap += _FORGETTING * (best.overlap - self._usual_overlap)
         return best.T_target_source if best.overlap >= _MIN_OVERLAP else guesses[0]
 
     def first_motion(self, first: Array, second: Array) -> Array:
-        """Return T_first_second of two scans about which nothing is known, the identity if none fits.
+        """Return T_first_second of two scans about which nothing is known.
 
-        Tries standing still and motions in all horizontal directions.
+        Tries standing still and motions in all horizontal directions; the identity if none fits.
         """
         self.checks += 1
-        angles = np.arange(_START_DIRECTIONS) * 2 * np.pi / _START_DIRECTIONS
-        shifts = [
-            np.array([0, 0, 0, d * np.cos(a), d * np.sin(a), 0])
-            for d in _START_DISTANCES
-            for a in angles
-        ]
-        best = self._register(first, second, [np.eye(4), *(exp(shift) for shift in shifts)])
+        best = self._register(first, second, [np.eye(4), *_shifts(_START_DISTANCES)])
         if best.overlap < _MIN_OVERLAP:
             logger.warning("the first two scans do not fit together; assuming standstill")
             return np.eye(4)
@@ -94,3 +98,13 @@ class MotionCheck:
         return register(
             Cloud.prepare(target, voxel), Cloud.prepare(source, voxel), guesses, self._voxel_size
         )
+
+
+def _shifts(distances: Sequence[float]) -> list[Array]:
+    """Return (4, 4) horizontal motions of the given lengths in all directions."""
+    angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
+    return [
+        exp(np.array([0, 0, 0, distance * np.cos(angle), distance * np.sin(angle), 0]))
+        for distance in distances
+        for angle in angles
+    ]
