@@ -11,7 +11,8 @@ How it is made fair:
 - Each system has a process of its own, which reads the scans into memory before the clock starts and
   is warmed up on a few of them. It has to be so: KISS-ICP's threads are set once in a process, by
   whoever comes first. The peers run with their packages' own settings, all cores included; ours as it
-  always does, with one thread for registration, so that runs repeat. Voxel size and ranges are the sensor's, for all three.
+  always does, with one thread for registration, so that runs repeat. Voxel size and ranges are the
+  sensor's, for all three.
 - The systems take turns on otherwise idle cores, forwards in one repeat and backwards in the next,
   with a fresh instance each time. Ratios are taken within a repeat; the median of them is reported.
 - Scans are handed over one by one, as in a run. Reading and cleaning them is not counted: it is the
@@ -26,6 +27,7 @@ import argparse
 import gc
 import multiprocessing
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -111,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     load_average = os.getloadavg()[0]
     try:
         given, timings = _benchmark(options)
-    except LifelongSlamError as error:
+    except (LifelongSlamError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     title = f"{options.scenario}, sensor {options.sensor}"
@@ -305,16 +307,21 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def facts(script: str, arguments: Sequence[str]) -> str:
     """Return a list of what the figures depend on: command, machine, versions."""
-    run = describe_run(arguments, 0)
+    run = describe_run(portable(arguments), 0)
     machine, packages = run["machine"], run["packages"]
     versions = ", ".join(f"{name} {packages[name]}" for name in _PACKAGES if name in packages)
     lines = (
-        f"command: `{' '.join(['python', f'benchmarks/{script}', *run['command_line']])}`",
+        f"command: `python benchmarks/{script} {shlex.join(run['command_line'])}`",
         f"machine: {machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']} GB",
         f"versions: Python {run['python']}, {versions}",
         f"commit: {run['git_commit'] or 'unknown'}",
     )
     return "\n".join(f"- {line}" for line in lines)
+
+
+def portable(arguments: Sequence[str]) -> list[str]:
+    """Return a command line without the places where this machine keeps its files."""
+    return [Path(a).name if Path(a).is_absolute() else a for a in arguments]
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
 from lifelong_slam.mapping.keyframe import Keyframe, KeyframeSelector
 from lifelong_slam.mapping.static_map import StaticMap, thin
 from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate
-from lifelong_slam.result import Edge, SlamResult, StageTimes
+from lifelong_slam.result import Edge, GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.trajectory import Trajectory
 
@@ -55,6 +55,7 @@ class LifelongSlam:
         self._odometry_poses: list[Array] = []
         self._anchors: list[int] = []  # index of the newest keyframe at each scan
         self._travelled = 0.0
+        self._watched = 0  # keyframes that a viewer has seen
         self._drift: Array = np.zeros(
             (6, 6)
         )  # covariance of the newest keyframe since the last closure
@@ -90,6 +91,14 @@ class LifelongSlam:
                 "loop closures outvoted": len(self._graph.rejected),
             },
         )
+
+    def watch(self) -> tuple[Array, GraphSnapshot | None]:
+        """Return the newest (4, 4) T_map_sensor, and the graph where a keyframe has been added."""
+        keyframe = self._keyframes[-1]
+        motion = invert(keyframe.T_odom_sensor) @ self._odometry_poses[-1]
+        news = len(self._keyframes) > self._watched
+        self._watched = len(self._keyframes)
+        return self._graph.pose(keyframe.id) @ motion, self._graph.snapshot() if news else None
 
     def _record(self, estimate: OdometryEstimate) -> None:
         if self._odometry_poses:

@@ -47,12 +47,15 @@ class Distortion:
     """
 
     def __init__(self) -> None:
-        self.covariance = np.zeros((6, 6))
+        self.covariance: Array = np.zeros((6, 6))
+        self._count = 0
 
     def update(self, deviation: Array, swept: float) -> None:
         """Take in a (6,) deviation from the prediction; `swept` is sweep time over scan interval."""
         shift = deviation * min(swept, 1.0) / 2
-        self.covariance += _FORGETTING * (np.outer(shift, shift) - self.covariance)
+        self._count += 1
+        weight = max(_FORGETTING, 1 / self._count)
+        self.covariance = (1 - weight) * self.covariance + weight * np.outer(shift, shift)
 
 
 class KissIcpOdometry:

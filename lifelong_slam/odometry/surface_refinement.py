@@ -37,11 +37,12 @@ class SurfaceRefinement:
     def refine(self, cloud: Cloud, guess: Array) -> tuple[Array, Array]:
         """Return the refined (4, 4) pose in the map and its (6, 6) covariance in the cloud's frame.
 
-        Where too little is known, or the answer leaves the guess by more than a voxel, the guess is
-        returned with a covariance that says how coarse it is.
+        The first scan defines the map and has no error. Where too little is known, or the answer
+        leaves the guess by more than a voxel, the guess is returned with a covariance that says how
+        coarse it is.
         """
         if self._last_insertion is None:
-            return guess, self._coarse_covariance()
+            return guess, np.zeros((6, 6))
         result = small_gicp.align(
             self._map,
             cloud.points,

@@ -1,0 +1,95 @@
+"""Are the covariances of odometry edges as large as the errors they stand for?
+
+Runs the front end on simulated campaigns, forms edges between keyframes as the pipeline does, and
+compares each with the truth: the normalised estimation error squared (NEES) of a consistent
+six-dimensional covariance averages 6, with a median of 5.3.
+
+    python benchmarks/covariance.py --scenarios A,D,E,F --sensors bosch,velodyne
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from numpy.typing import NDArray
+
+from lifelong_slam.config import build
+from lifelong_slam.geometry import adjoint, invert, log
+from lifelong_slam.mapping.keyframe import KeyframeSelector
+from lifelong_slam.odometry.odometry import OdometryEstimate
+
+Array = NDArray[np.float64]
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeErrors:
+    """(N, 6) errors of edges in the target's frame, rotation then translation, and covariances."""
+
+    errors: Array
+    covariances: Array
+
+    @property
+    def nees(self) -> Array:
+        """(N,) squared Mahalanobis distances."""
+        solved = np.linalg.solve(self.covariances, self.errors[..., None])[..., 0]
+        return np.einsum("ij,ij->i", self.errors, solved)
+
+
+def measure(scenario: str, sensor: str) -> EdgeErrors:
+    """Run the front end on a campaign and compare its keyframe edges with the truth."""
+    config = compose("config", overrides=[f"scenario={scenario}", f"sensor={sensor}"])
+    source = build(config.scenario)
+    odometry = build(config.odometry)
+    selector = KeyframeSelector(config.system.keyframe_distance, config.system.keyframe_rotation)
+    keyframes = [e for e in (odometry.register(scan) for scan in source) if selector.takes(e)]
+    reference = source.reference()
+    keyframes = [k for k in keyframes if k.stamp <= reference.stamps[-1]]
+    truth = reference.at(np.array([k.stamp for k in keyframes])) @ source.T_base_sensor
+    pairs = list(zip(range(len(keyframes) - 1), range(1, len(keyframes)), strict=True))
+    edges = [_edge(keyframes[i], keyframes[j], truth[i], truth[j]) for i, j in pairs]
+    return EdgeErrors(np.array([e for e, _ in edges]), np.array([c for _, c in edges]))
+
+
+def _edge(
+    source: OdometryEstimate, target: OdometryEstimate, true_source: Array, true_target: Array
+) -> tuple[Array, Array]:
+    motion = invert(source.T_odom_sensor) @ target.T_odom_sensor
+    A = adjoint(invert(motion))
+    covariance = A @ source.covariance @ A.T + target.covariance
+    return log(invert(invert(true_source) @ true_target) @ motion), covariance
+
+
+def main() -> None:
+    """Print a Markdown table of error, predicted standard deviation and NEES for each campaign."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--scenarios", default="A,B,C,D,E,F")
+    parser.add_argument("--sensors", default="bosch,velodyne")
+    arguments = parser.parse_args()
+    print(
+        "| scenario | sensor | edges | error mm | predicted mm | error mrad | predicted mrad | NEES mean | median |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for scenario in arguments.scenarios.split(","):
+            for sensor in arguments.sensors.split(","):
+                print(_row(scenario, sensor, measure(scenario, sensor)), flush=True)
+
+
+def _row(scenario: str, sensor: str, edges: EdgeErrors) -> str:
+    spread = np.sqrt(np.mean(edges.errors**2, axis=0))
+    predicted = np.sqrt(np.diagonal(np.median(edges.covariances, axis=0)))
+    return (
+        f"| {scenario} | {sensor} | {len(edges.errors)} "
+        f"| {1e3 * np.linalg.norm(spread[3:]):.1f} | {1e3 * np.linalg.norm(predicted[3:]):.1f} "
+        f"| {1e3 * np.linalg.norm(spread[:3]):.2f} | {1e3 * np.linalg.norm(predicted[:3]):.2f} "
+        f"| {np.mean(edges.nees):.1f} | {np.median(edges.nees):.1f} |"
+    )
+
+
+if __name__ == "__main__":
+    main()
