@@ -183,7 +183,9 @@ def _benchmark(options: argparse.Namespace) -> tuple[Input, dict[str, list[Timin
         for repeat in range(options.repeats):
             for system in turns(repeat):
                 bar.update(task, description=f"repeat {repeat + 1}: {system}")
-                timings[system].append(workers[system].submit(measure, lines[system]).result())
+                timing = workers[system].submit(measure, lines[system]).result()
+                timings[system].append(timing)
+                bar.console.print(f"repeat {repeat + 1}: {system} {timing.rate:.1f} scans/s")
                 bar.advance(task)
     return given, timings
 

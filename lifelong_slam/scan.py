@@ -39,10 +39,15 @@ class Scan:
 
     @property
     def end_stamp(self) -> int:
-        """Instant of the last point in nanoseconds: where a deskewed sweep's pose holds."""
+        """Instant of the last point in nanoseconds."""
         if self.offsets is None or len(self.offsets) == 0:
             return self.stamp
         return self.stamp + round(float(self.offsets.max()) * NANOSECONDS)
+
+    @property
+    def middle_stamp(self) -> int:
+        """Instant half-way between the first and the last point in nanoseconds."""
+        return self.end_stamp - round(self.duration * NANOSECONDS / 2)
 
     @property
     def duration(self) -> float:

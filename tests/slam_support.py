@@ -121,16 +121,18 @@ class Lidar:
 
 
 def drive(world, lidar, pose_at, times, seed=0):
-    """Return the scans that begin at `times` (s) along `pose_at`, and the poses at their ends."""
+    """Return the scans that begin at `times` (s) while the sensor moves along `pose_at`."""
     rng = np.random.default_rng(seed)
-    scans, truth = [], []
-    for t in times:
-        stamp = START + round(t * NANOSECONDS)
-        scan = lidar.sweep(world, pose_at(t), pose_at(t + lidar.duration), stamp, rng)
-        scans.append(scan)
-        truth.append(pose_at(t + scan.offsets.max() if len(scan.points) else t))
-    truth = np.array(truth)
-    return scans, invert(truth[0]) @ truth
+    return [
+        lidar.sweep(world, pose_at(t), pose_at(t + lidar.duration),
+                    START + round(t * NANOSECONDS), rng)
+        for t in times
+    ]  # fmt: skip
+
+
+def seconds(stamp):
+    """Return the time of a stamp on the clock of `drive`."""
+    return (stamp - START) / NANOSECONDS
 
 
 def surfaces(seed, sample=0, boxes=12, count=6000, extent=15.0, noise=0.0):

@@ -24,7 +24,7 @@ from kiss_icp.config.config import (
 from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import exp, invert, log
+from lifelong_slam.geometry import exp, invert, log, transform
 from lifelong_slam.odometry.motion_check import MotionCheck
 from lifelong_slam.odometry.odometry import OdometryEstimate
 from lifelong_slam.odometry.surface_refinement import SurfaceRefinement
@@ -113,7 +113,7 @@ class KissIcpOdometry:
 
     def _track(self, scan: Scan, last: OdometryEstimate) -> OdometryEstimate:
         """Predict, register, check, refine, enter."""
-        interval = (scan.end_stamp - last.stamp) / NANOSECONDS
+        interval = (scan.middle_stamp - last.stamp) / NANOSECONDS
         predicted = last.T_odom_sensor @ exp(self._velocity * interval)
         points = self._deskew(scan)
         guess = self._icp(points, predicted)
@@ -153,11 +153,11 @@ class KissIcpOdometry:
         self._kiss.local_map.update(downsampled, T)
         self._check.remember(downsampled, T)
         covariance = covariance + self._distortion.covariance
-        return OdometryEstimate(scan.end_stamp, T, covariance, points, cloud)
+        return OdometryEstimate(scan.middle_stamp, T, covariance, points, cloud)
 
     def _start_over(self, first: Scan, second: Scan) -> OdometryEstimate:
         """Find the motion between the first two scans, then enter the first one deskewed by it."""
-        interval = (second.end_stamp - first.end_stamp) / NANOSECONDS
+        interval = (second.middle_stamp - first.middle_stamp) / NANOSECONDS
         for _ in range(
             2
         ):  # as recorded, then freed of the distortion that the first answer implies
@@ -170,11 +170,14 @@ class KissIcpOdometry:
         return self._enter(first, self._deskew(first), np.eye(4))
 
     def _deskew(self, scan: Scan) -> Array:
-        """Crop a scan to range and move its points to the sensor's frame at the sweep's end."""
-        timed = scan.offsets is not None and scan.duration > 0
-        motion = exp(self._velocity * scan.duration) if timed else np.eye(4)
-        offsets = scan.offsets if timed and scan.offsets is not None else np.zeros(0)
-        return np.asarray(self._kiss.preprocessor.preprocess(scan.points, offsets, motion))
+        """Crop a scan to range and move its points to the sensor's frame at the sweep's middle."""
+        if scan.offsets is None or scan.duration == 0:
+            return self._crop(scan.points, np.zeros(0), np.eye(4))
+        at_end = self._crop(scan.points, scan.offsets, exp(self._velocity * scan.duration))
+        return transform(exp(self._velocity * scan.duration / 2), at_end)
+
+    def _crop(self, points: Array, offsets: Array, motion: Array) -> Array:
+        return np.asarray(self._kiss.preprocessor.preprocess(points, offsets, motion))
 
     def _is_gap(self, interval: float) -> bool:
         """Tell whether scans are missing, and learn the usual period."""
