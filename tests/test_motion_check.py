@@ -59,7 +59,7 @@ def test_scans_are_checked_where_they_were_registered():
 
 
 def test_where_nothing_fits_the_first_guess_stands():
-    elsewhere = surfaces(5, 1, boxes=4, extent=5.0) + [0, 0, 300.0]
+    elsewhere = surfaces(5, 1, boxes=4, extent=5.0) + np.array([0, 0, 300.0])
     guess = planar(1.0, 2.0, 0.3)
     found = check_that_knows(4).resolve(elsewhere, np.eye(4), [guess, np.eye(4)])
     np.testing.assert_array_equal(found, guess)
@@ -81,7 +81,7 @@ def test_the_first_motion_is_found_at_standstill_and_at_speed(T):
 
 
 def test_first_scans_that_do_not_fit_mean_standstill_and_a_warning(caplog):
-    far_away = surfaces(9, 1, boxes=4, extent=5.0) + [0, 0, 300.0]
+    far_away = surfaces(9, 1, boxes=4, extent=5.0) + np.array([0, 0, 300.0])
     with caplog.at_level(logging.WARNING):
         found = MotionCheck(VOXEL).first_motion(scene(8, 1), far_away)
     np.testing.assert_array_equal(found, np.eye(4))
@@ -91,7 +91,7 @@ def test_first_scans_that_do_not_fit_mean_standstill_and_a_warning(caplog):
 @pytest.mark.parametrize("counts", [(0, 500), (500, 0), (0, 0), (3, 500), (500, 3), (12, 12)])
 def test_next_to_nothing_to_compare_means_standstill(counts):
     first, second = (scene(10, i)[:n] for i, n in enumerate(counts))
-    found = MotionCheck(VOXEL).first_motion(first, second + [0, 0, 100.0])
+    found = MotionCheck(VOXEL).first_motion(first, second + np.array([0, 0, 100.0]))
     np.testing.assert_array_equal(found, np.eye(4))
 
 

@@ -12,6 +12,7 @@ from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.result import Edge
 
 COVARIANCE = np.diag(SIGMAS**2)
+NO_BIAS = np.zeros(6)
 
 
 def edge(i, j, T, kind="odometry", covariance=COVARIANCE):
@@ -32,7 +33,7 @@ def noise(rng, scale=1.0, sigmas=SIGMAS):
     return exp(rng.normal(size=6) * sigmas * scale)
 
 
-def laps(seed, count=60, lap=30, sigmas=SIGMAS, bias=np.zeros(6)):
+def laps(seed, count=60, lap=30, sigmas=SIGMAS, bias=NO_BIAS):
     """Return true poses on a circle driven more than once, and odometry with noise and bias."""
     rng = np.random.default_rng(seed)
     step = planar(2.0, 0.0, 2 * np.pi / lap)

@@ -90,7 +90,7 @@ def test_registration_repeats_to_the_last_bit():
 def test_overlap_is_one_for_the_same_scene_and_the_share_of_points_that_belong_to_it():
     target = surfaces(6, sample=1, noise=NOISE)
     source = surfaces(6, sample=2, noise=NOISE)
-    aloft = source + [0, 0, 40.0]
+    aloft = source + np.array([0, 0, 40.0])
     whole = Cloud.prepare(target, VOXEL)
     same = register(whole, Cloud.prepare(source, VOXEL), [np.eye(4)], VOXEL)
     assert same.overlap > 0.85
@@ -101,7 +101,7 @@ def test_overlap_is_one_for_the_same_scene_and_the_share_of_points_that_belong_t
 
 def test_disjoint_clouds_do_not_overlap():
     target = Cloud.prepare(surfaces(7, sample=1), VOXEL)
-    source = Cloud.prepare(surfaces(7, sample=2) + [500.0, 0, 0], VOXEL)
+    source = Cloud.prepare(surfaces(7, sample=2) + np.array([500.0, 0, 0]), VOXEL)
     result = register(target, source, [np.eye(4)], VOXEL)
     assert result.overlap == 0.0
     assert np.isfinite(result.covariance).all()
@@ -111,8 +111,8 @@ def test_a_point_near_a_surface_but_off_its_plane_does_not_overlap():
     target = Cloud.prepare(surfaces(8, sample=1, boxes=0, count=12000), VOXEL)
     lifted = Cloud.prepare(surfaces(8, sample=2, boxes=0, count=12000), VOXEL)
     # No iteration can move it back: two parallel planes half a metre apart, the source between them.
-    points = np.vstack([target.positions, target.positions + [0, 0, 1.0]])
-    between = Cloud.prepare(lifted.positions + [0, 0, 0.5], VOXEL)
+    points = np.vstack([target.positions, target.positions + np.array([0, 0, 1.0])])
+    between = Cloud.prepare(lifted.positions + np.array([0, 0, 0.5]), VOXEL)
     result = refine(Cloud.prepare(points, VOXEL), between, np.eye(4), 0.3)
     assert result.overlap < 0.1
 
@@ -214,7 +214,7 @@ def test_next_to_no_points_overlap_with_nothing_and_break_nothing(count):
     few = Cloud.prepare(surfaces(15)[:count], VOXEL)
     assert len(few) == count
     assert few.positions.shape == few.normals.shape == (count, 3)
-    many = Cloud.prepare(surfaces(15, sample=1) + [0, 0, 300.0], VOXEL)
+    many = Cloud.prepare(surfaces(15, sample=1) + np.array([0, 0, 300.0]), VOXEL)
     for target, source in ((many, few), (few, many), (few, few)):
         for result in (
             register(target, source, [np.eye(4)], VOXEL),

@@ -101,7 +101,7 @@ class LoopCloser:
         self, keyframe: Keyframe, pose: Callable[[int], Array], reach: float
     ) -> Keyframe | None:
         """Return the old keyframe within reach that is nearest in place and viewing direction."""
-        old = [k for k in self._keyframes if keyframe.travelled - k.travelled >= self._min_travel]
+        old = self._old(self._keyframes, keyframe)
         if not old:
             return None
         here = pose(keyframe.id)
@@ -120,12 +120,12 @@ class LoopCloser:
         cloud = Cloud.prepare(query.features.astype(np.float64), self._voxel_size)
         # Of the older local map, the keyframe nearest to where the query seems to be.
         target = pose(recognition.reference.id) @ recognition.T_reference_query
-        nearby = self._around(recognition.reference, 4 * _SUBMAP_REACH)
+        nearby = self._old(self._around(recognition.reference, 4 * _SUBMAP_REACH), query)
+        if not nearby:
+            return None
         candidate = min(
             nearby, key=lambda k: float(np.linalg.norm(pose(k.id)[:3, 3] - target[:3, 3]))
         )
-        if query.travelled - candidate.travelled < self._min_travel:
-            return None
         return self._verify(
             "appearance", candidate, query, cloud, invert(pose(candidate.id)) @ target, pose
         )
@@ -134,6 +134,10 @@ class LoopCloser:
         """Return the keyframes that were taken shortly before and after one, itself included."""
         i = self._index[keyframe.id]
         return self._keyframes[max(i - reach, 0) : i + reach + 1]
+
+    def _old(self, keyframes: list[Keyframe], query: Keyframe) -> list[Keyframe]:
+        """Return those of the keyframes that were left long enough before the query."""
+        return [k for k in keyframes if query.travelled - k.travelled >= self._min_travel]
 
     def _verify(
         self,
@@ -145,7 +149,8 @@ class LoopCloser:
         pose: Callable[[int], Array],
     ) -> Edge | None:
         """Register the query to the candidate's submap; log and count the outcome."""
-        around = self._around(candidate, _SUBMAP_REACH)
+        # Without what is recent: a submap that holds the query itself fits at any guess.
+        around = self._old(self._around(candidate, _SUBMAP_REACH), query)
         target = submap(around, [pose(k.id) for k in around], pose(candidate.id))
         verdict, result = self._verifier.verify(target, cloud, [guess])
         self.counts[f"loop by {kind}: {verdict}"] += 1

@@ -1,0 +1,312 @@
+"""Loop closures: which candidates are tried, what is refused, and what an accepted one says."""
+
+import logging
+
+import numpy as np
+import pytest
+from slam_support import (
+    Lidar,
+    corridor,
+    error_of,
+    keyframe,
+    planar,
+    surfaces,
+    town,
+)
+
+from lifelong_slam.geometry import adjoint, invert, transform
+from lifelong_slam.loop_closure.appearance import PlaceRecogniser
+from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
+from lifelong_slam.loop_closure.verification import Verdict, Verifier
+from lifelong_slam.registration import Cloud
+
+VOXEL = 0.5
+NOWHERE = np.zeros((0, 3))
+FLASH = Lidar(rings=24, columns=240, duration=0.0, reach=50.0)
+
+
+def view(world, T, seed=0):
+    """Return what a sensor at rest sees."""
+    return FLASH.sweep(world, T, T, rng=np.random.default_rng(seed)).points
+
+
+class Drive:
+    """Feeds keyframes at given poses to a closer, and keeps what it returns."""
+
+    def __init__(self, closer):
+        self.closer, self.poses, self.edges = closer, [], []
+        self.travelled = 0.0
+
+    def go(self, T_map_sensor, points=NOWHERE, travelled=None, sigma=0.0, belief=None):
+        """Arrive at a pose that the graph believes to be `belief`; return the new closures."""
+        if self.poses:
+            self.travelled += float(np.linalg.norm((self.last_true - T_map_sensor)[:3, 3]))
+        self.travelled = self.travelled if travelled is None else travelled
+        self.last_true = T_map_sensor
+        self.poses.append(T_map_sensor if belief is None else belief)
+        thinned = Cloud.prepare(points, VOXEL).positions
+        k = keyframe(len(self.poses) - 1, self.poses[-1], thinned, self.travelled)
+        cloud = Cloud.prepare(points, VOXEL)
+        edges = self.closer.close(k, cloud, lambda i: self.poses[i], sigma)
+        self.edges += edges
+        return edges
+
+    @property
+    def tried(self):
+        return sum(self.closer.counts.values())
+
+
+def closer(**settings):
+    # Local maps so long that appearance stays out of what is tested, unless asked for.
+    return LoopCloser(VOXEL, **{"local_map_length": 1e9, "min_travel": 30.0} | settings)
+
+
+@pytest.fixture(scope="module")
+def place():
+    return town(3, 50, lambda xy: np.abs(xy[:, 1]) < 5)
+
+
+def test_no_place_counts_as_revisited_before_enough_was_driven(place):
+    points = view(place, planar(0, 0, 0, 1.8))
+    for travelled, tried in ((29.0, 0), (31.0, 1)):
+        drive = Drive(closer())
+        drive.go(planar(0, 0, 0, 1.8), points, travelled=0.0)
+        drive.go(planar(0, 0, 0, 1.8), points, travelled=travelled)
+        assert drive.tried == tried
+
+
+@pytest.mark.parametrize(
+    ("distance", "sigma", "tried"),
+    [(5.0, 0.0, 1), (7.0, 0.0, 0), (7.0, 2.5, 1), (19.0, 100.0, 1), (21.0, 100.0, 0)],
+)
+def test_the_reach_follows_the_uncertainty_between_its_limits(distance, sigma, tried):
+    drive = Drive(closer(min_reach=6.0, max_reach=20.0))
+    drive.go(planar(0, 0), travelled=0.0)
+    drive.go(planar(distance, 0), travelled=100.0, sigma=sigma)
+    assert drive.tried == tried
+
+
+def test_attempts_by_place_keep_their_spacing():
+    drive = Drive(closer(spacing=8.0))
+    drive.go(planar(0, 0), travelled=0.0)
+    tried = [drive.go(planar(0, 0), travelled=100.0 + i) or drive.tried for i in range(20)]
+    assert tried[0] == 1
+    assert tried[7] == 1
+    assert tried[8] == 2
+    assert tried[19] == 3
+
+
+def test_of_places_as_near_the_one_with_the_same_view_is_tried(place):
+    same, across, far = planar(0, 2, 0, 1.8), planar(0, -2, np.pi, 1.8), planar(5, 0, 0, 1.8)
+    drive = Drive(closer(spacing=0.0))
+    for i, T in enumerate((across, same, far)):
+        drive.go(T, view(place, T), travelled=float(i))
+    here = planar(0, 0, 0, 1.8)
+    (edge,) = drive.go(here, view(place, here, 1), travelled=100.0)
+    assert (edge.source, edge.target) == (1, 3)
+    back = planar(0, 0, np.pi, 1.8)
+    (edge,) = drive.go(back, view(place, back, 2), travelled=101.0)
+    assert (edge.source, edge.target) == (0, 4)
+
+
+def test_an_accepted_edge_measures_the_true_motion_whatever_the_graph_believes(place):
+    first, again = planar(-3, 0, 0.1, 1.8), planar(-2, 1, -0.2, 1.8)
+    drive = Drive(closer())
+    drive.go(first, view(place, first), travelled=0.0)
+    belief = again @ planar(1.0, -0.8, 0.08)
+    (edge,) = drive.go(again, view(place, again, 1), travelled=100.0, belief=belief)
+    assert (edge.source, edge.target, edge.kind) == (0, 1, "loop")
+    distance, angle = error_of(edge.T_source_target, invert(first) @ again)
+    assert distance < 0.05
+    assert angle < 0.003
+    np.testing.assert_allclose(edge.covariance, edge.covariance.T)
+    assert np.linalg.eigvalsh(edge.covariance).min() > 0
+    assert drive.closer.counts == {"loop by place: accepted": 1}
+
+
+def test_an_edge_is_at_least_as_uncertain_as_the_keyframes_at_its_ends(place):
+    first, again = planar(-3, 0, 0.1, 1.8), planar(-2, 1, 1.2, 1.8)
+    drive = Drive(closer())
+    drive.go(first, view(place, first), travelled=0.0)
+    (edge,) = drive.go(again, view(place, again, 1), travelled=100.0)
+    ends = [keyframe(i, T, NOWHERE) for i, T in enumerate((first, again))]
+    own = relative_covariance(*ends, edge.T_source_target)
+    assert np.linalg.eigvalsh(edge.covariance - own).min() > -1e-12
+
+
+def test_covariances_of_two_ends_meet_in_the_frame_of_the_target():
+    rng = np.random.default_rng(0)
+    A, B = (rng.normal(size=(6, 6)) for _ in range(2))
+    source, target = (
+        keyframe(i, np.eye(4), NOWHERE, covariance=M @ M.T) for i, M in enumerate((A, B))
+    )
+    T = planar(4.0, 1.0, np.pi / 2)
+    carried = adjoint(invert(T)) @ (A @ A.T) @ adjoint(invert(T)).T
+    np.testing.assert_allclose(relative_covariance(source, target, T), carried + B @ B.T)
+
+
+def room(sample, width=8.0, length=20.0, count=3000):
+    """Return points on the floor and the four walls of a room."""
+    rng = np.random.default_rng(sample)
+    x, y = rng.uniform(-0.5, 0.5, (2, count)) * [[length], [width]]
+    up, half = rng.uniform(0, 3, count), np.full(count, 0.5)
+    return np.vstack(
+        [np.stack([x, y, 0 * up], 1)]
+        + [np.stack([x, side * width * half, up], 1) for side in (-1, 1)]
+        + [np.stack([side * length * half, y, up], 1) for side in (-1, 1)]
+    ) + rng.normal(scale=0.01, size=(5 * count, 3))
+
+
+# What the keyframe sees, what the place looked like, and what must become of it.
+CASES = {
+    Verdict.ACCEPTED: (surfaces(1, 1, noise=0.01), surfaces(1, 2, noise=0.01)),
+    Verdict.DIVERGED: (NOWHERE, surfaces(1, 2)),
+    Verdict.OVERLAP: (surfaces(2, 1), surfaces(3, 1, boxes=30)[2500:] + np.array([0, 0, 60.0])),
+    # A room 15 cm narrower: centred in the other, both its long walls are beside theirs.
+    Verdict.RESIDUAL: (room(1, width=7.85, count=1000)[1000:3000], room(2)[3000:9000]),
+    Verdict.DEGENERATE: (corridor(1, length=30.0), corridor(2)),
+}
+
+
+@pytest.mark.parametrize("verdict", CASES, ids=lambda v: v.name.lower())
+def test_each_verdict_is_reached_counted_and_logged_with_its_figures(verdict, caplog):
+    query, reference = CASES[verdict]
+    drive = Drive(closer())
+    drive.go(np.eye(4), reference, travelled=0.0)
+    with caplog.at_level(logging.INFO):
+        edges = drive.go(np.eye(4), query, travelled=100.0)
+    assert drive.closer.counts == {f"loop by place: {verdict}": 1}
+    assert len(edges) == (verdict is Verdict.ACCEPTED)
+    (message,) = [r.getMessage() for r in caplog.records if "loop 1 -> 0" in r.getMessage()]
+    assert f"by place: {verdict}" in message
+    for figure in ("overlap", "residual", "degeneracy"):
+        assert figure in message
+
+
+def test_a_place_that_only_looks_alike_in_part_is_refused(place):
+    elsewhere = town(4, 50, lambda xy: np.abs(xy[:, 1]) < 5)
+    T = planar(0, 0, 0, 1.8)
+    drive = Drive(closer())
+    drive.go(T, view(place, T), travelled=0.0)
+    assert drive.go(T, view(elsewhere, T), travelled=100.0) == []
+
+
+def test_a_keyframe_is_verified_against_its_candidates_whole_surroundings(place):
+    # From the far end only the submap, not the candidate alone, shows what the query sees.
+    poses = [planar(2.0 * i, 0, 0, 1.8) for i in range(7)]
+    drive = Drive(closer())
+    for i, T in enumerate(poses):
+        drive.go(T, view(place, T, i), travelled=float(i))
+    here = planar(6.5, 0.5, 0.0, 1.8)
+    (edge,) = drive.go(here, view(place, here, 9), travelled=100.0)
+    assert edge.source == 3
+    assert error_of(edge.T_source_target, invert(poses[3]) @ here)[0] < 0.05
+    alone = Verifier(VOXEL).verify(
+        view(place, poses[0], 0), Cloud.prepare(view(place, here, 9), VOXEL),
+        [invert(poses[0]) @ here],
+    )  # fmt: skip
+    joined = np.vstack(
+        [transform(invert(poses[0]) @ T, view(place, T, i)) for i, T in enumerate(poses)]
+    )
+    together = Verifier(VOXEL).verify(
+        joined, Cloud.prepare(view(place, here, 9), VOXEL), [invert(poses[0]) @ here]
+    )
+    assert together[1].overlap > alone[1].overlap + 0.05
+
+
+RECOGNISER = {"resolution": 0.25, "min_inliers": 10}
+FILLERS = 4  # the package never matches a local map with the three before it
+
+
+def rich_town(seed):
+    return town(seed, 60, lambda xy: np.abs(xy[:, 1]) < 5, spacing=4.0)
+
+
+def pass_through(world, offset, yaw, start=-28.0, first_id=0, travelled=0.0):
+    """Return keyframes of a straight drive through a town, in an odometry frame of its own."""
+    keyframes, poses = [], []
+    for i in range(29):
+        x = (start + 2.0 * i) * np.cos(yaw)
+        T = planar(x, offset, yaw, 1.8)
+        k = keyframe(
+            first_id + i,
+            invert(poses[0]) @ T if poses else np.eye(4),
+            Cloud.prepare(view(world, T, first_id + i), VOXEL).positions,
+            travelled + 2.0 * i,
+        )
+        keyframes.append(k)
+        poses.append(T)
+    return keyframes, poses
+
+
+@pytest.fixture(scope="module")
+def first_visit():
+    """Return the keyframes of a drive through a town and then through others, and their poses."""
+    keyframes, poses = [], []
+    for i in range(1 + FILLERS):
+        more = pass_through(rich_town(5 + i), 0.0, 0.0, first_id=29 * i, travelled=80.0 * i)
+        keyframes += more[0]
+        # In the map, which the recogniser does not know, the towns lie side by side.
+        poses += [planar(0, 300.0 * i) @ T for T in more[1]]
+    return keyframes, poses
+
+
+@pytest.mark.parametrize(("offset", "yaw"), [(0.0, 0.0), (2.0, 0.0), (2.0, np.pi), (-2.0, np.pi)])
+def test_a_place_is_recognised_from_another_lane_and_direction(first_visit, offset, yaw):
+    recogniser = PlaceRecogniser(length=54.0, **RECOGNISER)
+    first, truth = first_visit
+    again, true_again = pass_through(rich_town(5), offset, yaw, first_id=1000, travelled=900.0)
+    assert all(recogniser.add(k) is None for k in first)
+    (found,) = [r for r in map(recogniser.add, again) if r is not None]
+    i, j = found.reference.id, found.query.id - 1000
+    distance, angle = error_of(found.T_reference_query, invert(truth[i]) @ true_again[j])
+    assert distance < 1.5
+    assert angle < 0.1
+    assert found.inliers >= 10
+
+
+def test_another_town_is_not_recognised(first_visit):
+    recogniser = PlaceRecogniser(length=54.0, **RECOGNISER)
+    unknown = pass_through(rich_town(30), 0.0, 0.0, first_id=1000, travelled=900.0)[0]
+    for k in [*first_visit[0], *unknown]:
+        assert recogniser.add(k) is None
+
+
+def test_local_maps_of_nothing_are_recognised_as_nothing():
+    recogniser = PlaceRecogniser(length=5.0, **RECOGNISER)
+    for i in range(30):
+        assert recogniser.add(keyframe(i, planar(i, 0), NOWHERE)) is None
+
+
+def test_appearance_closes_a_loop_however_far_the_graph_has_drifted(first_visit):
+    drift = planar(45.0, -60.0, 0.8)
+    closing = LoopCloser(VOXEL, local_map_length=54.0, density_resolution=0.25, min_travel=30.0)
+    first, truth = first_visit
+    count = len(first)
+    again, true_again = pass_through(rich_town(5), 1.0, 0.0, first_id=count, travelled=900.0)
+    poses = [*truth, *(drift @ T for T in true_again)]
+    edges = []
+    for k in [*first, *again]:
+        cloud = Cloud.prepare(k.features.astype(float), VOXEL)
+        edges += closing.close(k, cloud, lambda i: poses[i], 5.0)
+    (edge,) = edges
+    assert closing.counts == {"loop by appearance: accepted": 1}
+    distance, angle = error_of(
+        edge.T_source_target, invert(truth[edge.source]) @ true_again[edge.target - count]
+    )
+    assert distance < 0.1
+    assert angle < 0.005
+
+
+def test_two_closers_find_the_same_edges_to_the_last_bit(place):
+    found = []
+    for _ in range(2):
+        drive = Drive(closer(spacing=0.0))
+        for i, x in enumerate((0.0, 2.0, 4.0, 1.0, 3.0)):
+            T = planar(x, 0, 0, 1.8)
+            drive.go(T, view(place, T, i), travelled=float(i if i < 3 else 100 + i))
+        found.append(drive.edges)
+    assert len(found[0]) == len(found[1]) == 2
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a.T_source_target, b.T_source_target)
+        np.testing.assert_array_equal(a.covariance, b.covariance)
