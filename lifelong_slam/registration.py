@@ -69,6 +69,8 @@ class Registration:
         error: GICP's cost at the solution.
         inliers: points that have a correspondence.
         overlap: fraction of source points that lie on a target surface.
+        support: the same with each point weighted by how much it says about the motion, so that a few
+            poles have the voice of all the ground; what guesses are compared by.
         residual: RMS distance in metres of those points from the planes they lie on.
         converged: whether the last stage converged.
     """
@@ -78,6 +80,7 @@ class Registration:
     error: float
     inliers: int
     overlap: float
+    support: float
     residual: float
     converged: bool
 
@@ -131,8 +134,8 @@ def register(
 ) -> Registration:
     """Align `source` to `target` from several guesses and return the best fit.
 
-    Each guess is aligned coarse to fine. The fit that puts most source points onto target surfaces
-    wins; ties go to the earlier guess.
+    Each guess is aligned coarse to fine. The fit with the best support wins; ties go to the earlier
+    guess.
 
     Args:
         target: cloud that stays.
@@ -143,7 +146,7 @@ def register(
     best: Registration | None = None
     for guess in guesses:
         candidate = _align(target, source, guess, max_distance)
-        if best is None or candidate.overlap > best.overlap:
+        if best is None or candidate.support > best.support:
             best = candidate
     if best is None:
         raise ValueError("register needs at least one guess")
@@ -153,7 +156,7 @@ def register(
 def refine(target: Cloud, source: Cloud, guess: Array, max_distance: float) -> Registration:
     """Align `source` to `target` from a guess known to be good: the fine stage only."""
     if len(target) == 0 or len(source) == 0:  # small_gicp reads beyond an empty cloud
-        return Registration(guess, np.zeros((6, 6)), 0.0, 0, 0.0, 0.0, converged=False)
+        return Registration(guess, np.zeros((6, 6)), 0.0, 0, 0.0, 0.0, 0.0, converged=False)
     return _judge(target, source, _gicp(target, source, guess, max_distance, _FINE_ITERATIONS))
 
 
@@ -188,12 +191,26 @@ def _judge(target: Cloud, source: Cloud, result: small_gicp.RegistrationResult) 
     off_plane = np.abs(np.einsum("ij,ij->i", moved - target.positions[nearest], normals))
     planar = np.einsum("ij,ij->i", normals, normals) > 0
     on_surface = planar & (distance < SURFACE_REACH) & (off_plane < SURFACE_THICKNESS)
+    weights = _leverage(source.normals)
     return Registration(
         T_target_source=np.asarray(result.T_target_source),
         hessian=np.asarray(result.H),
         error=float(result.error),
         inliers=int(result.num_inliers),
         overlap=float(on_surface.mean()) if len(on_surface) else 0.0,
+        support=float(weights[on_surface].sum() / max(weights.sum(), 1e-12)),
         residual=float(np.sqrt(np.mean(off_plane[on_surface] ** 2))) if on_surface.any() else 0.0,
         converged=bool(result.converged),
     )
+
+
+def _leverage(normals: Array) -> Array:
+    """Return how much each of (N, 3) plane normals adds to what is known about translation.
+
+    On a road nine points in ten are ground, and rings on the ground coincide best where the sensor
+    stands still; all together they are one direction of three (statistical leverage, as in
+    normal-space sampling: Rusinkiewicz and Levoy, 3DIM 2001).
+    """
+    information = normals.T @ normals + (1e-3 * len(normals) + 1e-9) * np.eye(3)
+    weights: Array = np.einsum("ij,jk,ik->i", normals, np.linalg.inv(information), normals)
+    return weights

@@ -34,6 +34,7 @@ class PoseGraph:
         self._edges: list[Edge] = []
         self._factors: list[gtsam.NonlinearFactor] = []
         self._rejected: set[int] = set()  # indices into edges
+        self._solved: set[int] = set()  # loop closures that the current poses are the optimum of
 
     def __len__(self) -> int:
         return len(self._ids)
@@ -95,17 +96,46 @@ class PoseGraph:
                 otherwise they vote only if one of those in use disagrees with the optimum.
         """
         loops = {i for i, edge in enumerate(self._edges) if edge.kind == "loop"}
+        before, solved = self._values, self._solved - self._rejected
         if not (reconsider and self._rejected):
-            self._solve(loops - self._rejected)
-            if all(self.agrees(self._edges[i]) for i in loops - self._rejected):
+            used = loops - self._rejected
+            # What the new closures cost all edges together: a lone one that is wrong bends a long
+            # chain of odometry without any single edge, itself included, standing out.
+            rise = -self._cost(solved)
+            self._solve(used)
+            rise += self._cost(used)
+            undisputed = all(self.agrees(self._edges[i]) for i in used)
+            if undisputed and rise <= _THRESHOLD * max(len(used - solved), 1):
                 return
         self._vote(loops)
         self._solve(loops - self._rejected)
+        self._choose(loops, before, solved)
+
+    def _choose(self, loops: set[int], before: gtsam.Values, solved: set[int]) -> None:
+        """Go back to the closures from before the vote where all edges together fit better so.
+
+        Non-convexity is graduated by each closure's own residual, which a long chain of odometry can
+        absorb; the truncated squares that the vote means to minimise also count what that costs.
+        """
+        voted, values, rejected = loops - self._rejected, self._values, self._rejected
+        objective = self._cost(voted) + _THRESHOLD * len(rejected)
+        self._values = before
+        self._solve(solved)
+        if self._cost(solved) + _THRESHOLD * len(loops - solved) < objective:
+            self._rejected = loops - solved
+            logger.info("%d of %d loop closures are outvoted", len(self._rejected), len(loops))
+        else:
+            self._values, self._rejected, self._solved = values, rejected, voted
+
+    def _cost(self, loops: set[int]) -> float:
+        """Return the sum of squared Mahalanobis distances with the given loop closures."""
+        return 2 * float(self._nonlinear_graph(loops).error(self._values))
 
     def _solve(self, loops: set[int]) -> None:
         """Run Levenberg-Marquardt with the given loop closures."""
         graph = self._nonlinear_graph(loops)
         self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm()).optimize()
+        self._solved = set(loops)
 
     def _vote(self, loops: set[int]) -> None:
         """Decide which loop closures are in by graduated non-convexity."""

@@ -36,6 +36,8 @@ logger = logging.getLogger(__name__)
 
 _FORGETTING = 0.05  # weight of the newest scan: a memory of two seconds at 10 Hz
 _GAP = 3.0  # usual periods without a scan, after which the velocity says little
+_GLANCE = 20_000  # points; ICP thins them to some thousand anyway
+_MIN_POINTS = 50  # in range; fewer say less than the prediction does
 
 
 class Distortion:
@@ -101,6 +103,9 @@ class KissIcpOdometry:
 
     def register(self, scan: Scan) -> OdometryEstimate:
         """Estimate the pose of a cleaned scan that is newer than all before it."""
+        glance = self._glance(scan)
+        if len(glance) < _MIN_POINTS:
+            return self._predict(scan, glance)
         if self._last is None:
             self._first_scan = scan
             self._last = self._enter(scan, self._deskew(scan), np.eye(4))
@@ -108,17 +113,27 @@ class KissIcpOdometry:
             if self._first_scan is not None:
                 self._last = self._start_over(self._first_scan, scan)
                 self._first_scan = None
-            self._last = self._track(scan, self._last)
+                glance = self._glance(scan)
+            self._last = self._track(scan, glance, self._last)
         return self._last
 
-    def _track(self, scan: Scan, last: OdometryEstimate) -> OdometryEstimate:
-        """Predict, register, check, refine, enter."""
+    def _predict(self, scan: Scan, points: Array) -> OdometryEstimate:
+        """Go on as before for a scan that is next to empty; the next one is tracked from the last good."""
+        T = np.eye(4)
+        if self._last is not None:
+            interval = (scan.middle_stamp - self._last.stamp) / NANOSECONDS
+            T = self._last.T_odom_sensor @ exp(self._velocity * interval)
+        cloud = Cloud.prepare(points, self._voxel_size)
+        covariance = self._refinement.coarse_covariance
+        return OdometryEstimate(scan.middle_stamp, T, covariance, points, cloud)
+
+    def _track(self, scan: Scan, glance: Array, last: OdometryEstimate) -> OdometryEstimate:
+        """Predict, register a glance at the scan, check, then deskew, refine and enter all of it."""
         interval = (scan.middle_stamp - last.stamp) / NANOSECONDS
         predicted = last.T_odom_sensor @ exp(self._velocity * interval)
-        points = self._deskew(scan)
-        guess = self._icp(points, predicted)
+        guess = self._icp(glance, predicted)
         if self._is_gap(interval) or self._check.is_suspicious(predicted, guess):
-            guess = self._check.resolve(points, last.T_odom_sensor, [guess, predicted])
+            guess = self._check.resolve(glance, last.T_odom_sensor, [guess, predicted])
         # Deskew anew by the mean of the old and the new velocity: the old one lags behind, the new one
         # would feed each registration's noise into the next.
         self._velocity = (self._velocity + log(invert(last.T_odom_sensor) @ guess) / interval) / 2
@@ -168,6 +183,12 @@ class KissIcpOdometry:
         self._check = MotionCheck(self._voxel_size)
         self._refinement = SurfaceRefinement(self._voxel_size)
         return self._enter(first, self._deskew(first), np.eye(4))
+
+    def _glance(self, scan: Scan) -> Array:
+        """Deskew a scan's every n-th point by the old velocity: as many as ICP has a use for."""
+        stride = max(1, len(scan.points) // _GLANCE)
+        offsets = None if scan.offsets is None else scan.offsets[::stride]
+        return self._deskew(Scan(scan.stamp, scan.points[::stride], offsets))
 
     def _deskew(self, scan: Scan) -> Array:
         """Crop a scan to range and move its points to the sensor's frame at the sweep's middle."""

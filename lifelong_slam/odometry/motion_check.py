@@ -35,7 +35,7 @@ _MAX_ROTATION = 0.035  # rad (2 degrees) beside the prediction that ICP's basin 
 _MAX_TRANSLATION = 0.3  # the same in voxels
 _POOR = 0.9  # of the usual overlap, below which a fit is doubted
 _FORGETTING = 0.1  # weight of the newest check in the usual overlap
-_MIN_OVERLAP = 0.4  # below it not even the best guess is an answer
+_MIN_SUPPORT = 0.4  # below it not even the best guess is an answer
 
 
 class MotionCheck:
@@ -49,7 +49,7 @@ class MotionCheck:
         """
         self._voxel_size = voxel_size
         self._recent: deque[tuple[Array, Array]] = deque(maxlen=_RECENT_SCANS)
-        self._usual_overlap = 0.0
+        self._usual_support = 0.0
         self.checks = 0
 
     def remember(self, points: Array, T_odom_sensor: Array) -> None:
@@ -74,12 +74,12 @@ class MotionCheck:
         target = np.vstack([transform(pose, cloud) for cloud, pose in self._recent])
         turns = [T_last @ exp(np.array([0, 0, yaw, 0, 0, 0])) for yaw in _YAW_GUESSES]
         best = self._register(target, points, [*guesses, T_last, *turns])
-        if best.overlap < _POOR * self._usual_overlap:
+        if best.support < _POOR * self._usual_support:
             shifts = [best.T_target_source @ shift for shift in _shifts(_ALIAS_DISTANCES)]
             shifted = self._register(target, points, shifts)
-            best = max(best, shifted, key=lambda registration: registration.overlap)
-        self._usual_overlap += _FORGETTING * (best.overlap - self._usual_overlap)
-        return best.T_target_source if best.overlap >= _MIN_OVERLAP else guesses[0]
+            best = max(best, shifted, key=lambda registration: registration.support)
+        self._usual_support += _FORGETTING * (best.support - self._usual_support)
+        return best.T_target_source if best.support >= _MIN_SUPPORT else guesses[0]
 
     def first_motion(self, first: Array, second: Array) -> Array:
         """Return T_first_second of two scans about which nothing is known.
@@ -88,7 +88,7 @@ class MotionCheck:
         """
         self.checks += 1
         best = self._register(first, second, [np.eye(4), *_shifts(_START_DISTANCES)])
-        if best.overlap < _MIN_OVERLAP:
+        if best.support < _MIN_SUPPORT:
             logger.warning("the first two scans do not fit together; assuming standstill")
             return np.eye(4)
         return best.T_target_source

@@ -55,7 +55,7 @@ class SurfaceRefinement:
         moved = np.linalg.norm(T[:3, 3] - guess[:3, 3])
         if result.num_inliers < _MIN_INLIERS or not moved < self._voxel_size:
             self.refused += 1
-            return guess, self._coarse_covariance()
+            return guess, self.coarse_covariance
         return T, covariance_of(np.asarray(result.H), result.error, result.num_inliers)
 
     def insert(self, cloud: Cloud, T_odom_sensor: Array) -> None:
@@ -68,6 +68,8 @@ class SurfaceRefinement:
         self._map.insert(cloud.points, T_odom_sensor)
         self._last_insertion = T_odom_sensor
 
-    def _coarse_covariance(self) -> Array:
+    @property
+    def coarse_covariance(self) -> Array:
+        """(6, 6) covariance of a pose that nothing has refined."""
         sigma = _LOST_SIGMA * self._voxel_size
         return np.diag([sigma**2 / 25] * 3 + [sigma**2] * 3)  # rad: sigma seen over 5 m
