@@ -35,7 +35,7 @@ class EdgeErrors:
     def nees(self) -> Array:
         """(N,) squared Mahalanobis distances."""
         solved = np.linalg.solve(self.covariances, self.errors[..., None])[..., 0]
-        return np.einsum("ij,ij->i", self.errors, solved)
+        return np.asarray(np.einsum("ij,ij->i", self.errors, solved))
 
 
 def measure(scenario: str, sensor: str) -> EdgeErrors:

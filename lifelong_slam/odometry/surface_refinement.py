@@ -10,7 +10,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import invert, rotation_angle
+from lifelong_slam.geometry import invert, log, rotation_angle
 from lifelong_slam.registration import Cloud, covariance_of
 
 Array = NDArray[np.float64]
@@ -20,6 +20,9 @@ _CLEAR_CYCLE = 10
 _ITERATIONS = 10
 _INSERT_ROTATION = 0.1  # rad; a narrow sensor sees new surfaces after a turn of 6 degrees
 _MIN_INLIERS = 50  # points on known surfaces without which there is nothing to refine with
+_FORGETTING = 0.05  # weight of the newest scan in how far refinements usually move a pose
+_FAR = 2.0  # times the usual, beyond which a refinement was drawn away by something that moves
+_FIRST_MOVE = 0.05  # voxels; what is usual before anything is known
 _LOST_SIGMA = 0.5  # voxels; how well an unrefined pose is known
 
 
@@ -32,14 +35,15 @@ class SurfaceRefinement:
         self._map = small_gicp.GaussianVoxelMap(voxel_size)
         self._map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
         self._last_insertion: Array | None = None
+        self._usual_move = (_FIRST_MOVE * voxel_size) ** 2  # mean square, m^2
         self.refused = 0
 
     def refine(self, cloud: Cloud, guess: Array) -> tuple[Array, Array]:
         """Return the refined (4, 4) pose in the map and its (6, 6) covariance in the cloud's frame.
 
-        The first scan defines the map and has no error. Where too little is known, or the answer
-        leaves the guess by more than a voxel, the guess is returned with a covariance that says how
-        coarse it is.
+        The first scan defines the map and has no error. Voxelised GICP has no robust kernel, KISS-ICP
+        has: a refinement that moves the pose much further than usual was drawn by a moving thing. Then,
+        and where too little is known, the guess is returned, with a covariance that says so.
         """
         if self._last_insertion is None:
             return guess, np.zeros((6, 6))
@@ -52,11 +56,22 @@ class SurfaceRefinement:
             num_threads=1,
         )
         T = np.asarray(result.T_target_source)
-        moved = np.linalg.norm(T[:3, 3] - guess[:3, 3])
-        if result.num_inliers < _MIN_INLIERS or not moved < self._voxel_size:
+        if result.num_inliers < _MIN_INLIERS or not np.isfinite(T).all():
             self.refused += 1
             return guess, self.coarse_covariance
-        return T, covariance_of(np.asarray(result.H), result.error, result.num_inliers)
+        covariance = covariance_of(np.asarray(result.H), result.error, result.num_inliers)
+        if self._is_far(float(np.linalg.norm(T[:3, 3] - guess[:3, 3]))):
+            self.refused += 1
+            dispute = log(invert(guess) @ T)
+            return guess, covariance + np.outer(dispute, dispute)
+        return T, covariance
+
+    def _is_far(self, move: float) -> bool:
+        """Tell whether a refinement moves a pose by more than is usual, and learn what is (m)."""
+        limit = float(_FAR * np.sqrt(self._usual_move))
+        learnt = min(move, 2 * limit)  # so that one outlier doesn't open the door for the next
+        self._usual_move += _FORGETTING * (learnt**2 - self._usual_move)
+        return move > limit
 
     def insert(self, cloud: Cloud, T_odom_sensor: Array) -> None:
         """Enter a registered cloud where the sensor has moved enough to see something new."""
