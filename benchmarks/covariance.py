@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--sensors", default="bosch,velodyne")
     arguments = parser.parse_args()
     print(
-        "| scenario | sensor | edges | error mm | predicted mm | error mrad | predicted mrad | NEES mean | median |"
+        "| scenario | sensor | edges | error mm | predicted | error mrad | predicted | NEES mean | median |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     with initialize_config_dir(str(CONF), version_base="1.3"):
