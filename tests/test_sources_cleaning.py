@@ -5,7 +5,15 @@ import pytest
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import Scan
-from lifelong_slam.sources.cleaning import AHEAD, BACKWARDS, EMPTY, REPEATED, InputCounts, clean
+from lifelong_slam.sources.cleaning import (
+    AHEAD,
+    BACKWARDS,
+    EMPTY,
+    REPEATED,
+    STUMP,
+    InputCounts,
+    clean,
+)
 
 PERIOD = 100_000_000
 
@@ -112,3 +120,11 @@ def test_counts_are_live(caplog):
     next(stream)
     next(stream)
     assert counts.used == 2
+
+
+def test_a_stump_that_would_send_poses_back_in_time_is_skipped():
+    stump = Scan(PERIOD // 4, np.ones((4, 3)), np.linspace(0, 0.01, 4))
+    out, counts = run([scan(0), stump, scan(1)])
+    assert [s.stamp for s in out] == [0, PERIOD]
+    assert counts.skipped == {STUMP: 1}
+    assert out[0].middle_stamp < out[1].middle_stamp

@@ -22,7 +22,7 @@ _INSERT_ROTATION = 0.1  # rad; a narrow sensor sees new surfaces after a turn of
 _MIN_INLIERS = 50  # points on known surfaces without which there is nothing to refine with
 _FORGETTING = 0.05  # weight of the newest scan in how far refinements usually move a pose
 _FAR = 2.0  # times the usual, beyond which a refinement was drawn away by something that moves
-_FIRST_MOVE = 0.05  # voxels; what is usual before anything is known
+_LEARNING = 20  # scans before it is known what is usual
 _LOST_SIGMA = 0.5  # voxels; how well an unrefined pose is known
 
 
@@ -35,7 +35,8 @@ class SurfaceRefinement:
         self._map = small_gicp.GaussianVoxelMap(voxel_size)
         self._map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
         self._last_insertion: Array | None = None
-        self._usual_move = (_FIRST_MOVE * voxel_size) ** 2  # mean square, m^2
+        self._usual_move = 0.0  # mean square, m^2
+        self._count = 0
         self.refused = 0
 
     def refine(self, cloud: Cloud, guess: Array) -> tuple[Array, Array]:
@@ -68,9 +69,11 @@ class SurfaceRefinement:
 
     def _is_far(self, move: float) -> bool:
         """Tell whether a refinement moves a pose by more than is usual, and learn what is (m)."""
-        limit = float(_FAR * np.sqrt(self._usual_move))
+        self._count += 1
+        limit = float(_FAR * np.sqrt(self._usual_move)) if self._count > _LEARNING else np.inf
         learnt = min(move, 2 * limit)  # so that one outlier doesn't open the door for the next
-        self._usual_move += _FORGETTING * (learnt**2 - self._usual_move)
+        weight = max(_FORGETTING, 1 / self._count)
+        self._usual_move += weight * (learnt**2 - self._usual_move)
         return move > limit
 
     def insert(self, cloud: Cloud, T_odom_sensor: Array) -> None:

@@ -17,6 +17,7 @@ EMPTY = "empty"
 REPEATED = "stamp repeated"
 BACKWARDS = "stamp ran back"
 AHEAD = "stamp jumped ahead"
+STUMP = "sweep ended before the last one"
 UNREADABLE = "unreadable"
 
 GAP_FACTOR = 3.0
@@ -75,7 +76,7 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
 
 def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     intervals: deque[int] = deque(maxlen=_INTERVALS)
-    last: int | None = None
+    last: Scan | None = None
     for scan, after in _with_next(source):
         counts.read += 1
         scan = _finite(scan, counts)
@@ -83,8 +84,8 @@ def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
             _skip(scan, reason, counts)
             continue
         if last is not None:
-            _note_gap(scan, last, intervals, counts)
-        last = scan.stamp
+            _note_gap(scan, last.stamp, intervals, counts)
+        last = scan
         counts.used += 1
         yield scan
 
@@ -117,15 +118,22 @@ def _with_next(source: Iterable[Scan]) -> Iterator[tuple[Scan, Scan | None]]:
         yield scan, None
 
 
-def _why_skip(scan: Scan, last: int | None, after: Scan | None) -> str | None:
+def _why_skip(scan: Scan, last: Scan | None, after: Scan | None) -> str | None:
     if len(scan.points) == 0:
         return EMPTY
-    if last is not None and scan.stamp <= last:
-        return REPEATED if scan.stamp == last else BACKWARDS
+    if last is not None and scan.stamp <= last.stamp:
+        return REPEATED if scan.stamp == last.stamp else BACKWARDS
     if after is not None and scan.stamp - after.stamp > _JUMP:
         # one wrong stamp far ahead would turn all that follow into scans that ran back
-        return AHEAD if last is None or after.stamp > last else None
+        return AHEAD if last is None or after.stamp > last.stamp else None
+    if last is not None and not _sweeps_on(scan, last):
+        return STUMP
     return None
+
+
+def _sweeps_on(scan: Scan, last: Scan) -> bool:
+    """Tell whether a sweep's middle and end lie after those of the last: poses hold there."""
+    return scan.middle_stamp > last.middle_stamp and scan.end_stamp > last.end_stamp
 
 
 def _skip(scan: Scan, reason: str, counts: InputCounts) -> None:
