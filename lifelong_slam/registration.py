@@ -16,7 +16,7 @@ from lifelong_slam.geometry import transform
 
 Array = NDArray[np.float64]
 
-CORRELATED_POINTS = 30.0  # points that share one error (see docs/covariance.md for the measurement)
+CORRELATED_POINTS = 30.0  # points that share one error (measured by benchmarks/covariance.py)
 SURFACE_REACH = 1.0  # metres within which a target point vouches for its plane
 SURFACE_THICKNESS = (
     0.1  # metres off the plane that still count as on it: sensor noise and roughness

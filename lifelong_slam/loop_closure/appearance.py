@@ -7,10 +7,12 @@ from map_closures.config import MapClosuresConfig
 from map_closures.map_closures import MapClosures
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import invert
-from lifelong_slam.mapping.keyframe import Keyframe, submap
+from lifelong_slam.geometry import invert, transform
+from lifelong_slam.mapping.keyframe import Keyframe
 
 Array = NDArray[np.float64]
+
+_STRIDE = 4  # every fourth map point: a density image needs no more
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,14 @@ class PlaceRecogniser:
         return self._match(centre, self._local_map(keyframes, centre))
 
     def _local_map(self, keyframes: list[Keyframe], centre: Keyframe) -> Array:
-        return submap(keyframes, [k.T_odom_sensor for k in keyframes], centre.T_odom_sensor)
+        """Join the map points of keyframes; the features are too sparse to tell places apart."""
+        T_centre_odom = invert(centre.T_odom_sensor)
+        return np.vstack(
+            [
+                transform(T_centre_odom @ k.T_odom_sensor, k.points[::_STRIDE].astype(np.float64))
+                for k in keyframes
+            ]
+        )
 
     def _match(self, centre: Keyframe, points: Array) -> Recognition | None:
         self._centres.append(centre)
