@@ -16,7 +16,8 @@ from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
 
 from lifelong_slam.config import build
-from lifelong_slam.geometry import adjoint, invert, log
+from lifelong_slam.geometry import invert, log
+from lifelong_slam.loop_closure.closer import relative_covariance
 from lifelong_slam.mapping.keyframe import KeyframeSelector
 from lifelong_slam.odometry.odometry import OdometryEstimate
 
@@ -57,8 +58,7 @@ def _edge(
     source: OdometryEstimate, target: OdometryEstimate, true_source: Array, true_target: Array
 ) -> tuple[Array, Array]:
     motion = invert(source.T_odom_sensor) @ target.T_odom_sensor
-    A = adjoint(invert(motion))
-    covariance = A @ source.covariance @ A.T + target.covariance
+    covariance = relative_covariance(source, target, motion)
     return log(invert(invert(true_source) @ true_target) @ motion), covariance
 
 

@@ -56,9 +56,8 @@ class LifelongSlam:
         self._anchors: list[int] = []  # index of the newest keyframe at each scan
         self._travelled = 0.0
         self._watched = 0  # keyframes that a viewer has seen
-        self._drift: Array = np.zeros(
-            (6, 6)
-        )  # covariance of the newest keyframe since the last closure
+        # Covariance of the newest keyframe since the last closure.
+        self._drift: Array = np.zeros((6, 6))
 
     def process(self, scan: Scan) -> StageTimes:
         """Take in one scan: odometry always, the graph if the scan becomes a keyframe."""
@@ -75,7 +74,7 @@ class LifelongSlam:
             loop_ms=loop_ms,
             optimise_ms=optimise_ms,
             vertices=len(self._graph),
-            edges=len(self._graph.edges),
+            edges=self._graph.edge_count,
         )
 
     def finish(self) -> SlamResult:

@@ -45,6 +45,11 @@ class PoseGraph:
         return [edge for i, edge in enumerate(self._edges) if i not in self._rejected]
 
     @property
+    def edge_count(self) -> int:
+        """Number of edges in use."""
+        return len(self._edges) - len(self._rejected)
+
+    @property
     def rejected(self) -> list[Edge]:
         """Loop closures that the last vote left out."""
         return [self._edges[i] for i in sorted(self._rejected)]

@@ -7,8 +7,8 @@ from map_closures.config import MapClosuresConfig
 from map_closures.map_closures import MapClosures
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import invert, transform
-from lifelong_slam.mapping.keyframe import Keyframe
+from lifelong_slam.geometry import invert
+from lifelong_slam.mapping.keyframe import Keyframe, join
 
 Array = NDArray[np.float64]
 
@@ -61,13 +61,8 @@ class PlaceRecogniser:
 
     def _local_map(self, keyframes: list[Keyframe], centre: Keyframe) -> Array:
         """Join the map points of keyframes; the features are too sparse to tell places apart."""
-        T_centre_odom = invert(centre.T_odom_sensor)
-        return np.vstack(
-            [
-                transform(T_centre_odom @ k.T_odom_sensor, k.points[::_STRIDE].astype(np.float64))
-                for k in keyframes
-            ]
-        )
+        clouds = [keyframe.points[::_STRIDE] for keyframe in keyframes]
+        return join(clouds, [k.T_odom_sensor for k in keyframes], centre.T_odom_sensor)
 
     def _match(self, centre: Keyframe, points: Array) -> Recognition | None:
         self._centres.append(centre)

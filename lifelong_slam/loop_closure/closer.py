@@ -11,6 +11,7 @@ from lifelong_slam.geometry import adjoint, invert
 from lifelong_slam.loop_closure.appearance import PlaceRecogniser
 from lifelong_slam.loop_closure.verification import Verdict, Verifier
 from lifelong_slam.mapping.keyframe import Keyframe, submap
+from lifelong_slam.odometry.odometry import OdometryEstimate
 from lifelong_slam.registration import Cloud
 from lifelong_slam.result import Edge
 
@@ -167,8 +168,12 @@ class LoopCloser:
         return Edge(candidate.id, query.id, result.T_target_source, covariance, "loop")
 
 
-def relative_covariance(source: Keyframe, target: Keyframe, T_source_target: Array) -> Array:
-    """Return the (6, 6) covariance, in the target's frame, that two keyframes' own errors cause."""
+def relative_covariance(
+    source: Keyframe | OdometryEstimate,
+    target: Keyframe | OdometryEstimate,
+    T_source_target: Array,
+) -> Array:
+    """Return the (6, 6) covariance, in the target's frame, that the errors of both ends cause."""
     A = adjoint(invert(T_source_target))
     covariance: Array = A @ source.covariance @ A.T + target.covariance
     return covariance

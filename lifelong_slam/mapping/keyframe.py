@@ -68,10 +68,15 @@ def submap(keyframes: Sequence[Keyframe], poses: Sequence[Array], centre: Array)
         poses: (4, 4) T_map_keyframe of each.
         centre: (4, 4) T_map_centre.
     """
+    return join([keyframe.features for keyframe in keyframes], poses, centre)
+
+
+def join(clouds: Sequence[NDArray[np.float32]], poses: Sequence[Array], centre: Array) -> Array:
+    """Join (N_i, 3) clouds with poses T_map_cloud into (N, 3) points in the frame T_map_centre."""
     T_centre_map = invert(centre)
     return np.vstack(
         [
-            transform(T_centre_map @ pose, keyframe.features.astype(np.float64))
-            for keyframe, pose in zip(keyframes, poses, strict=True)
+            transform(T_centre_map @ pose, cloud.astype(np.float64))
+            for cloud, pose in zip(clouds, poses, strict=True)
         ]
     )

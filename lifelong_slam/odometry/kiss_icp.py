@@ -43,9 +43,10 @@ _MIN_POINTS = 50  # in range; fewer say less than the prediction does
 class Distortion:
     """How far the motion within a sweep departs from the constant velocity it is deskewed by.
 
-    A velocity that is off by as much as the prediction turned out to be shifts a sweep's points by
-    up to that deviation, their mean by half of it. The registration can't see this error, its Hessian
-    says nothing of it, and on a swaying car it is the larger one.
+    A velocity that is off by as much as the prediction turned out to be shifts the points at both ends
+    of a sweep by half of that deviation, in opposite directions. They cancel only where surfaces are
+    spread evenly over the sweep; the registration's Hessian says nothing of what remains, and on a
+    swaying car it is the larger error.
     """
 
     def __init__(self) -> None:
