@@ -16,6 +16,7 @@ SYSTEM = "system=kiss_icp"
         "seed=1",
         "scenario=A,B,C,D,E,F sensor=bosch,velodyne",
         "scenario=loop scenario.laps=2,3",
+        "scenario=seasons scenario.session=1,2 sensor=vls128",
         "scenario=bag scenario.path=/some/file.bag",
         "scenario=glob([A-F])",
         "hydra.run.dir=/tmp/x hydra.verbose=true",

@@ -5,13 +5,19 @@ import json
 import math
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.simulation.seeds import generator
 from lifelong_slam.simulation.sensors import make_sensor
 
 # Counts up whenever the same config would give another recording, so that no stale one is read.
 SIMULATION_VERSION = 8
+
+# Left out of a campaign's digest where unset, so that recordings from before there were sessions
+# are still found.
+_LATE_SETTINGS = ("overlap", "session", "start_shift")
 
 _DISTANCE_TOLERANCE = 0.005  # of the distance that the route's segments may differ from it
 
@@ -96,6 +102,10 @@ class Campaign(_Data):
         distance: metres driven, in one lap where there are several.
         speed: average speed, m/s.
         laps: how often a closed route is driven; 1 and open otherwise.
+        overlap: metres that a closed route is driven on after the last lap.
+        session: which visit of a place that changes between visits, from 1; None for a place that
+            stays as it is. See `lifelong_slam.simulation.seasons`.
+        start_shift: metres along the route from one session's start to the next one's.
         route: pieces of the route.
         traffic: moving road users.
         crosstalk: share of a sensor's beams that return crosstalk, by sensor.
@@ -111,6 +121,9 @@ class Campaign(_Data):
     speed: float = Field(gt=0)
     laps: int = Field(1, ge=1)
     closed: bool = False
+    overlap: float = Field(0.0, ge=0)
+    session: int | None = Field(None, ge=1, le=300)
+    start_shift: float = Field(0.0, ge=0)
     route: tuple[Segment, ...] = Field(min_length=1)
     traffic: tuple[Traffic, ...] = ()
     crosstalk: dict[str, Annotated[float, Field(ge=0, le=0.5)]] = Field(default_factory=dict)
@@ -126,6 +139,12 @@ class Campaign(_Data):
             raise ValueError(f"the route is {length:.2f} m long, not {self.distance} m")
         if self.laps > 1 and not self.closed:
             raise ValueError("only a closed route can have several laps")
+        if (self.overlap or self.start_shift) and not self.closed:
+            raise ValueError("only a closed route can have an 'overlap' or a 'start_shift'")
+        if self.session is None and self.start_shift:
+            raise ValueError("'start_shift' needs a 'session'")
+        if self.session is not None and self.kind != "urban":
+            raise ValueError("only a world of kind 'urban' changes between sessions")
         if self.kind != "ramp" and any(stream.road == "motorway" for stream in self.traffic):
             raise ValueError("only a world of kind 'ramp' has a 'motorway' for traffic")
         for name in {*self.rig, *self.crosstalk, *self.azimuth_steps}:
@@ -135,11 +154,26 @@ class Campaign(_Data):
     @property
     def duration(self) -> float:
         """Seconds that the recording takes."""
-        return self.distance * self.laps / self.speed
+        return (self.distance * self.laps + self.overlap) / self.speed
+
+    @property
+    def start(self) -> float:
+        """Metres along the route where the session starts."""
+        return 0.0 if self.session is None else (self.session - 1) * self.start_shift
+
+    def generator(self, use: str, index: int = 0) -> np.random.Generator:
+        """Return the generator for what differs from session to session, such as noise."""
+        visit = "" if self.session is None else f" in session {self.session}"
+        return generator(self.seed, use + visit, index)
+
+    def settings(self) -> dict[str, Any]:
+        """Return all that the recording depends on, as JSON's types."""
+        unset = {name for name in _LATE_SETTINGS if not getattr(self, name)}
+        return self.model_dump(mode="json", exclude=unset)
 
     def digest(self) -> str:
         """Return a short hash of this config and the simulation's version."""
-        text = json.dumps([SIMULATION_VERSION, self.model_dump(mode="json")], sort_keys=True)
+        text = json.dumps([SIMULATION_VERSION, self.settings()], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

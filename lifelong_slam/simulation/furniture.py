@@ -41,6 +41,41 @@ def cabinet(rng: np.random.Generator) -> Mesh:
     return merge(parts)
 
 
+def parcel(rng: np.random.Generator) -> Mesh:
+    """Return what is left on a pavement for a while: boxes, a loaded pallet or wheeled bins."""
+    choice = rng.random()
+    if choice < 0.4:
+        return _boxes(rng)
+    return _pallet(rng) if choice < 0.7 else _bins(int(rng.integers(1, 4)))
+
+
+def _boxes(rng: np.random.Generator) -> Mesh:
+    """Return a crate with smaller boxes on it."""
+    parts, z = [], 0.0
+    x, y = rng.uniform(0.3, 0.5, 2)
+    for _ in range(int(rng.integers(1, 4))):
+        height = rng.uniform(0.4, 0.7)
+        parts.append(box((-x, -y, z), (x, y, z + height), 0.5))
+        z, x, y = z + height, x * rng.uniform(0.7, 0.95), y * rng.uniform(0.7, 0.95)
+    return merge(parts)
+
+
+def _pallet(rng: np.random.Generator) -> Mesh:
+    """Return a pallet of 1.2 m by 0.8 m with goods on it."""
+    planks = [box((-0.6, y - 0.05, 0), (0.6, y + 0.05, 0.14), _WOOD) for y in (-0.35, 0, 0.35)]
+    load = box((-0.57, -0.37, 0.14), (0.57, 0.37, rng.uniform(0.6, 1.5)), 0.55)
+    return merge([*planks, load])
+
+
+def _bins(count: int) -> Mesh:
+    """Return a row of wheeled bins along x."""
+    parts = []
+    for x in (np.arange(count) - (count - 1) / 2) * 0.75:
+        parts.append(box((x - 0.28, -0.33, 0.05), (x + 0.28, 0.33, 0.98), 0.3))
+        parts.append(box((x - 0.3, -0.37, 0.98), (x + 0.3, 0.37, 1.07), 0.3))
+    return merge(parts)
+
+
 def shelter() -> Mesh:
     """Return a bus shelter with a bench and a stop's pole, open towards +y."""
     return merge(

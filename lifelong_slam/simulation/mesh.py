@@ -33,6 +33,10 @@ class Mesh:
         """Return the mesh mapped by a (4, 4) affine matrix."""
         return Mesh(self.triangles @ T[:3, :3].T + T[:3, 3], self.reflectivity)
 
+    def subset(self, chosen: NDArray[np.bool_]) -> "Mesh":
+        """Return the triangles that `chosen` (M,) selects."""
+        return Mesh(self.triangles[chosen], self.reflectivity[chosen])
+
     @property
     def areas(self) -> Array:
         """(M,) areas in square metres."""

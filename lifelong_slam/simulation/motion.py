@@ -28,6 +28,7 @@ class VehicleMotion:
         path: the line that the driver follows.
         terrain: what the car drives on.
         distance: metres to drive along the path.
+        start: metres along the path where the drive starts.
         speed: average speed, m/s.
         wobble: amplitude of the lateral deviation from the line, metres.
         rng: decides the wobble, the speed's variation and the suspension.
@@ -42,11 +43,12 @@ class VehicleMotion:
         speed: float,
         wobble: float,
         rng: np.random.Generator,
+        start: float = 0.0,
     ) -> None:
         self.duration = distance / speed
         count = int(np.ceil((self.duration + 2 * _MARGIN) * KNOT_RATE)) + 1
         t: Array = np.linspace(-_MARGIN, self.duration + _MARGIN, count, dtype=np.float64)
-        s = _progress(path, distance, self.duration, speed, rng)(t)
+        s = _progress(path, start, distance, self.duration, speed, rng)(t)
         xy = path.point(s, wobble * _waves(s, rng, 30.0, 120.0))
         knots = np.concatenate([xy, np.zeros((count, 4))], axis=1)
         self._fill(knots, CubicSpline(t, xy), t, terrain, rng)
@@ -98,16 +100,21 @@ class VehicleMotion:
 
 
 def _progress(
-    path: Path, distance: float, duration: float, speed: float, rng: np.random.Generator
+    path: Path,
+    start: float,
+    distance: float,
+    duration: float,
+    speed: float,
+    rng: np.random.Generator,
 ) -> CubicSpline:
     """Return arc length over time: slower in bends, a little uneven, `distance` in `duration`."""
     beyond = 4 * _MARGIN * speed
-    s = np.arange(-beyond, distance + beyond, 0.25, dtype=np.float64)
+    s = start + np.arange(-beyond, distance + beyond, 0.25, dtype=np.float64)
     pull = speed**2 * np.abs(path.curvature(s)) / _LATERAL_COMFORT
     factor = (1 + _SPEED_VARIATION * _waves(s, rng, 40.0, 150.0)) / (1 + pull**2) ** 0.25
     t = np.concatenate([[0.0], cumulative_trapezoid(1 / factor, s)])
-    start, end = np.interp([0.0, distance], s, t)
-    return CubicSpline((t - start) * duration / (end - start), s)
+    first, last = np.interp([start, start + distance], s, t)
+    return CubicSpline((t - first) * duration / (last - first), s)
 
 
 def _waves(x: Array, rng: np.random.Generator, shortest: float, longest: float) -> Array:

@@ -26,12 +26,14 @@ class Hits:
         cosine: of the angle of incidence, 0 to 1.
         reflectivity: of the surface.
         moving: whether it belongs to a moving road user.
+        triangle: its number in the static mesh; of no meaning where moving, or where there is nothing.
     """
 
     distance: Floats
     cosine: Floats
     reflectivity: Floats
     moving: NDArray[np.bool_]
+    triangle: NDArray[np.uint32]
 
 
 class Caster:
@@ -47,14 +49,19 @@ class Caster:
             o3d.core.Tensor.from_numpy(np.arange(3 * len(mesh), dtype=np.uint32).reshape(-1, 3)),
         )
 
-    def cast(self, rays: Floats) -> tuple[Floats, Floats, Floats]:
-        """Cast (N, 6) rays, origin and unit direction; return distance, cosine, reflectivity."""
+    def cast(self, rays: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.uint32]]:
+        """Cast (N, 6) rays, origin and unit direction.
+
+        Returns:
+            Distance, cosine, reflectivity and number of the triangle, (N,) each; see `Hits`.
+        """
         answer = self.cast_only(rays)
         triangle = answer["primitive_ids"].numpy()
         normal = answer["primitive_normals"].numpy()
         cosine = np.abs(np.einsum("ni,ni->n", normal, rays[:, 3:]))
         last = np.uint32(len(self._reflectivity) - 1)
-        return answer["t_hit"].numpy(), cosine, self._reflectivity[np.minimum(triangle, last)]
+        reflectivity = self._reflectivity[np.minimum(triangle, last)]
+        return answer["t_hit"].numpy(), cosine, reflectivity, triangle
 
     def cast_only(self, rays: Floats) -> dict[str, Any]:
         """Return Open3D's own answer for (N, 6) rays; nothing is looked up."""
@@ -84,8 +91,9 @@ class SweepCaster:
         rays, T_world_sensor = self.rays(start)
         shape = rays.shape[:2]
         found = self._static.cast(rays.reshape(-1, 6))
-        distance, cosine, reflectivity = (values.reshape(shape) for values in found)
-        hits = Hits(distance, cosine, reflectivity, np.zeros(shape, dtype=np.bool_))
+        distance, cosine, reflectivity = (values.reshape(shape) for values in found[:3])
+        moving = np.zeros(shape, dtype=np.bool_)
+        hits = Hits(distance, cosine, reflectivity, moving, found[3].reshape(shape))
         for actor, shape_caster in self._actors:
             self._cast_actor(actor, shape_caster, start, T_world_sensor, hits)
         return hits
@@ -111,7 +119,7 @@ class SweepCaster:
             return
         T_actor_sensor = invert(T_world_actor[columns]) @ T_world_sensor[columns]
         rays = _rays_from(T_actor_sensor, self.directions[columns])
-        found = caster.cast(rays.reshape(-1, 6))
+        found = caster.cast(rays.reshape(-1, 6))[:3]
         distance, cosine, reflectivity = (values.reshape(rays.shape[:2]) for values in found)
         nearer = distance < hits.distance[columns]
         for whole, part in (

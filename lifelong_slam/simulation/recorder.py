@@ -27,9 +27,9 @@ from lifelong_slam.simulation.messages import (
     mounting_message,
     odometry_message,
 )
+from lifelong_slam.simulation.movables import SeenMovables, write_movables
 from lifelong_slam.simulation.raycast import Caster, Floats, SweepCaster
 from lifelong_slam.simulation.returns import measure
-from lifelong_slam.simulation.seeds import generator
 from lifelong_slam.simulation.sensors import SWEEP_SECONDS, Sensor, make_sensor
 from lifelong_slam.simulation.surface import visible_surface
 from lifelong_slam.simulation.truth import LabelWriter, write_mesh_ply, write_points_ply
@@ -39,8 +39,9 @@ from lifelong_slam.trajectory import Trajectory, write_tum
 logger = logging.getLogger(__name__)
 
 START_STAMP = 1_655_283_600 * NANOSECONDS  # 15 June 2022, 09:00 UTC
+_SEASON = 91 * 86_400 * NANOSECONDS  # from one session to the next
 BAG_NAME, TRUTH_NAME = "campaign.bag", "truth.tum"
-SURFACE_NAME, WORLD_NAME = "surface.ply", "world.ply"
+SURFACE_NAME, WORLD_NAME, MOVABLES_NAME = "surface.ply", "world.ply", "movable.npz"
 
 _SURFACE_SPACING = 2.0  # metres driven between the places that the surface is looked at from
 _SURFACE_STRIDE = 3  # every third column is enough for voxels of half a metre
@@ -55,13 +56,18 @@ def record(campaign: Campaign, folder: Path) -> None:
     logger.info("recording %s: %d triangles", campaign.name, len(world.static))
     _write_bag(campaign, world, casters, folder)
     _write_truth(campaign, world, casters, folder)
-    description = {"simulation_version": SIMULATION_VERSION, **campaign.model_dump(mode="json")}
+    description = {"simulation_version": SIMULATION_VERSION, **campaign.settings()}
     (folder / "campaign.json").write_text(json.dumps(description, indent=2) + "\n")
 
 
-def seconds_to_stamps(t: NDArray[np.float64]) -> NDArray[np.int64]:
+def start_stamp(campaign: Campaign) -> int:
+    """Return the stamp in nanoseconds of a recording's start; sessions are a season apart."""
+    return START_STAMP + ((campaign.session or 1) - 1) * _SEASON
+
+
+def seconds_to_stamps(campaign: Campaign, t: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the stamps in nanoseconds of (N,) seconds since the recording's start."""
-    return START_STAMP + np.round(t * NANOSECONDS).astype(np.int64)
+    return start_stamp(campaign) + np.round(t * NANOSECONDS).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,25 +78,31 @@ class _Lidar:
     caster: SweepCaster
     cloud: Connection
     labels: LabelWriter
+    seen: SeenMovables | None
 
     def record(self, campaign: Campaign, bag: Writer, k: int) -> None:
         """Write the k-th sweep and its labels."""
         start = k * SWEEP_SECONDS
-        stamp = int(seconds_to_stamps(np.array([start]))[0])
+        stamp = int(seconds_to_stamps(campaign, np.array([start]))[0])
         crosstalk = campaign.crosstalk.get(self.sensor.name, 0.0)
-        rng = generator(campaign.seed, self.sensor.name, k)
-        returns = measure(self.caster.cast(start), self.sensor, rng, crosstalk)
+        rng = campaign.generator(self.sensor.name, k)
+        hits = self.caster.cast(start)
+        returns = measure(hits, self.sensor, rng, crosstalk)
         message = cloud_message(
             returns, self.sensor, self.caster.directions, self.caster.offsets, stamp, k
         )
         # Bags hold the time of receipt, and a sweep is only sent once it is complete.
         bag.write(self.cloud, stamp + round(SWEEP_SECONDS * NANOSECONDS), message)
         self.labels.add(stamp, returns.label)
+        if self.seen:
+            rays, _ = self.caster.rays(start)
+            self.seen.add(rays, hits, returns)
 
 
 def _write_bag(campaign: Campaign, world: World, casters: list[SweepCaster], folder: Path) -> None:
     sweeps, each = sweep_count(campaign), round(RATE * SWEEP_SECONDS)
-    ins = Ins(world.motion, generator(campaign.seed, "ins"))
+    ins = Ins(world.motion, campaign.generator("ins"))
+    seen = SeenMovables(world.movables, len(world.static)) if world.movables else None
     with ExitStack() as stack:
         bag = stack.enter_context(Writer(folder / BAG_NAME))
         progress = stack.enter_context(_progress_bar())
@@ -101,17 +113,20 @@ def _write_bag(campaign: Campaign, world: World, casters: list[SweepCaster], fol
             sensor = caster.sensor
             cloud = bag.add_connection(sensor.topic, CLOUD_TYPE, typestore=TYPESTORE)
             labels = stack.enter_context(LabelWriter(folder, sensor.name))
-            lidars.append(_Lidar(sensor, caster, cloud, labels))
-        mounting = mounting_message([caster.sensor for caster in casters], START_STAMP)
-        bag.write(tf, START_STAMP, mounting)
+            lidars.append(_Lidar(sensor, caster, cloud, labels, seen))
+        first = start_stamp(campaign)
+        bag.write(tf, first, mounting_message([caster.sensor for caster in casters], first))
         name = f"Recording scenario {campaign.name}"
         for k in progress.track(range(sweeps), description=name):
-            for stamp, message in _odometry(ins, range(k * each, (k + 1) * each)):
+            for stamp, message in _odometry(campaign, ins, range(k * each, (k + 1) * each)):
                 bag.write(imar, stamp, message)
             for lidar in lidars:
                 lidar.record(campaign, bag, k)
-        for stamp, message in _odometry(ins, range(sweeps * each, _sample_count(campaign))):
+        rest = range(sweeps * each, _sample_count(campaign))
+        for stamp, message in _odometry(campaign, ins, rest):
             bag.write(imar, stamp, message)
+    if seen:
+        write_movables(folder / MOVABLES_NAME, seen.truth())
 
 
 def sweep_count(campaign: Campaign) -> int:
@@ -125,11 +140,11 @@ def _sample_count(campaign: Campaign) -> int:
     return math.floor(seconds * RATE + 1e-6) + 1
 
 
-def _odometry(ins: Ins, samples: range) -> Iterator[tuple[int, bytes]]:
+def _odometry(campaign: Campaign, ins: Ins, samples: range) -> Iterator[tuple[int, bytes]]:
     """Yield stamp and message of the odometry by the number of the sample."""
     t = np.array(samples) / RATE
     for i, stamp, T, twist in zip(
-        samples, seconds_to_stamps(t).tolist(), *ins.measure(t), strict=True
+        samples, seconds_to_stamps(campaign, t).tolist(), *ins.measure(t), strict=True
     ):
         yield stamp, odometry_message(T, twist, ins.deviations, stamp, i)
 
@@ -138,15 +153,16 @@ def _write_truth(
     campaign: Campaign, world: World, casters: list[SweepCaster], folder: Path
 ) -> None:
     t = np.arange(_sample_count(campaign)) / RATE
-    write_tum(folder / TRUTH_NAME, Trajectory(seconds_to_stamps(t), world.motion.poses(t)))
+    stamps = seconds_to_stamps(campaign, t)
+    write_tum(folder / TRUTH_NAME, Trajectory(stamps, world.motion.poses(t)))
     step = max(round(_SURFACE_SPACING / campaign.speed / SWEEP_SECONDS), 1)
-    one_lap = int(sweep_count(campaign) / campaign.laps)
+    one_lap = int(sweep_count(campaign) / (campaign.laps + campaign.overlap / campaign.distance))
     with _progress_bar() as progress:
         sweeps = progress.track(range(0, one_lap, step), description="Sampling the true surface")
         points = visible_surface(
             world.static,
             _views(casters, sweeps),
-            generator(campaign.seed, "surface"),
+            campaign.generator("surface"),
             reach=max(caster.sensor.kept_range[1] for caster in casters),
         )
     write_points_ply(folder / SURFACE_NAME, points)

@@ -1,6 +1,8 @@
 """A site being built: roads, terrain, what has been put on it, and where there is still room."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,21 @@ _GROUND_STEP = 2.0  # metres between the points of the open ground
 _SINK = 0.04  # metres that open ground lies below a verge, so that it never covers one
 _OVERLAP = 0.4  # metres that open ground reaches under a road's edge at least
 _ROUGHNESS = 0.03  # metres, standard deviation of open ground's height
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Something that stands on a site.
+
+    Attributes:
+        mesh: in the world's frame.
+        T_world_part: (4, 4) where it was put.
+        kind: `car` and `tree` for what looks different on another visit, None for all else.
+    """
+
+    mesh: Mesh
+    T_world_part: Array
+    kind: Literal["car", "tree"] | None = None
 
 
 class Site:
@@ -37,7 +54,7 @@ class Site:
         edge_rise: float,
     ) -> None:
         self.roads, self.terrain, self.rng = roads, terrain, rng
-        self.parts: list[Mesh] = []
+        self.parts: list[Part] = []
         corners = np.concatenate([_corridor(road, 4.0) for road in roads])
         self._low, self._high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
         shape = np.ceil((self._high - self._low) / _CELL).astype(int) + 1
@@ -46,14 +63,17 @@ class Site:
         for road in roads:
             self.claim(_corridor(road, _CELL * 0.7))
 
-    def add(self, mesh: Mesh, T: Array | None = None) -> None:
-        """Add a mesh, moved by the pose T (4, 4) if given."""
-        self.parts.append(mesh if T is None else mesh.moved(T))
+    def add(
+        self, mesh: Mesh, T: Array | None = None, kind: Literal["car", "tree"] | None = None
+    ) -> None:
+        """Add a mesh, moved by the pose T (4, 4) if given; see `Part` for its kind."""
+        moved = Part(mesh, np.eye(4), kind) if T is None else Part(mesh.moved(T), T, kind)
+        self.parts.append(moved)
 
     def build(self) -> Mesh:
         """Return all there is: parts, road surfaces and open ground."""
         surfaces = [road_mesh(road, self.roads, self.terrain) for road in self.roads]
-        return merge([self._ground(), *surfaces, *self.parts])
+        return merge([self._ground(), *surfaces, *(part.mesh for part in self.parts)])
 
     def pose(self, road: Road, s: float, lateral: float, turn: float = 0.0) -> Array:
         """Return the upright (4, 4) pose on the land beside a road, x along it plus `turn`."""

@@ -44,6 +44,9 @@ class SimulatedSource:
         wobble: metres.
         closed: whether the route closes.
         laps: of a closed route.
+        overlap: metres beyond the last lap.
+        session: of a place that changes between visits.
+        start_shift: metres from session to session.
         seed: of world, traffic and noise.
 
     Raises:
@@ -66,12 +69,16 @@ class SimulatedSource:
         wobble: float = 0.05,
         closed: bool = False,
         laps: int = 1,
+        overlap: float = 0.0,
+        session: int | None = None,
+        start_shift: float = 0.0,
         seed: int = 0,
     ) -> None:
         self.campaign = make_campaign(
             name=name, kind=kind, distance=distance, speed=speed, route=route, rig=rig,
             traffic=traffic, crosstalk=crosstalk or {}, azimuth_steps=azimuth_steps or {},
-            wobble=wobble, closed=closed, laps=laps, seed=seed,
+            wobble=wobble, closed=closed, laps=laps, overlap=overlap, session=session,
+            start_shift=start_shift, seed=seed,
         )  # fmt: skip
         _check_topic(self.campaign, topic)
         self.folder = ensure_recorded(self.campaign, Path(cache_dir))

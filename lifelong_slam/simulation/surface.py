@@ -52,7 +52,7 @@ def _seen_voxels(
     near: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     seen = near
     for batch in rays:
-        distance, _, _ = caster.cast(batch)
+        distance, *_ = caster.cast(batch)
         hit, distance = batch[distance < reach], distance[distance < reach]
         keys = _keys((hit[:, :3] + hit[:, 3:] * distance[:, None]) / _VOXEL)
         near, seen = np.union1d(near, keys[distance < _NEAR]), np.union1d(seen, keys)

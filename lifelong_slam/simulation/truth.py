@@ -8,6 +8,7 @@ Files of a campaign's folder:
 - `surface.ply`: points, with normals, on the true static surface where the rig can see it; world
   frame, metres.
 - `world.ply`: the whole static surface as triangles, for distances that no sampling blurs.
+- `movable.npz`: with sessions only; what changes between them (`lifelong_slam.simulation.movables`).
 """
 
 from dataclasses import dataclass

@@ -20,14 +20,14 @@ from lifelong_slam.simulation.routes import Path
 from lifelong_slam.simulation.site import Site, footprint
 from lifelong_slam.simulation.terrain import Terrain
 from lifelong_slam.simulation.vegetation import bush, conifer, hedge, tree
-from lifelong_slam.simulation.vehicles import make_vehicle
+from lifelong_slam.simulation.vehicles import parked_vehicle
 
 _STUB = 90.0  # metres of a side street
 _STUB_CLEARANCE = 30.0  # metres that a side street keeps from other roads, away from its junction
 _PARKED = 0.55  # share of parking places that are taken
 _PLACE = 6.2  # metres a parking place
 _JUNCTION = 9.0  # metres off another carriageway within which nobody parks or plants
-_KERB = 0.12
+KERB = 0.12  # metres that pavements lie above the carriageway
 
 
 def urban_site(
@@ -39,7 +39,7 @@ def urban_site(
         ahead = _stub(path, start, 1.0, roads[0])
         behind = _stub(path, end, -1.0, roads[0])
         roads += [Road(stub, urban_profile()) for stub in (ahead, behind)]
-    site = Site(roads, terrain, margin=45.0, rng=rng, edge_rise=_KERB - 0.05)
+    site = Site(roads, terrain, margin=45.0, rng=rng, edge_rise=KERB - 0.05)
     for road in roads:
         _furnish(site, road)
         for side in (1.0, -1.0):
@@ -77,7 +77,7 @@ def _furnish(site: Site, road: Road) -> None:
             T = site.pose(road, s + rng.uniform(-1, 1), lateral, 0.0 if side < 0 else np.pi)
             if not site.clear_of_others(road, T, 1.5):
                 continue
-            T[2, 3] += _KERB
+            T[2, 3] += KERB
             if i % 4 == (0 if side > 0 else 2):
                 site.add(lamp_post(), T)
             elif site.clear_of_others(road, T, _JUNCTION):
@@ -88,7 +88,7 @@ def _something(site: Site, T: Array) -> None:
     rng = site.rng
     choice = rng.random()
     if choice < 0.38:
-        site.add(tree(rng, float(rng.uniform(5, 9))), T)
+        site.add(tree(rng, float(rng.uniform(5, 9))), T, "tree")
     elif choice < 0.52:
         site.add(sign(rng), T)
     elif choice < 0.62:
@@ -110,7 +110,7 @@ def _park(site: Site, road: Road, side: float) -> None:
         T = site.pose(road, s + rng.normal(0, 0.3), edge - side * rng.uniform(1.02, 1.15), turn)
         if not site.clear_of_others(road, T, _JUNCTION):
             continue
-        site.add(make_vehicle("van" if rng.random() < 0.15 else "car", rng), T)
+        site.add(parked_vehicle(rng), T, "car")
 
 
 def _build_row(site: Site, road: Road, side: float) -> None:
@@ -180,8 +180,11 @@ def _plant_behind(site: Site) -> None:
                 site.add(building(rng, 4.5, 3.5, 2.8), T)
         elif site.free(footprint(T, 2.0, 2.0)):
             site.claim(footprint(T, 2.0, 2.0))
-            make = conifer if size > 0.8 else tree
-            site.add(make(rng, float(rng.uniform(5, 12))), T)
+            height = float(rng.uniform(5, 12))
+            if size > 0.8:
+                site.add(conifer(rng, height), T)
+            else:
+                site.add(tree(rng, height), T, "tree")
 
 
 def junction_turns(lengths: list[tuple[float, float, float]]) -> Iterator[tuple[float, float]]:

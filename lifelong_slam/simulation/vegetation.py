@@ -1,6 +1,7 @@
 """Trees, bushes and hedges."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lifelong_slam.simulation.mesh import Mesh, merge
 from lifelong_slam.simulation.shapes import cylinder, leaves
@@ -23,6 +24,11 @@ def tree(rng: np.random.Generator, height: float) -> Mesh:
         count = int(45 * spread)
         parts.append(leaves(rng, tip, radii, count, 0.14 * spread + 0.12, _LEAF))
     return merge(parts)
+
+
+def foliage(plant: Mesh) -> NDArray[np.bool_]:
+    """Return which of a plant's triangles (M,) are leaves; the others are wood."""
+    return np.asarray(plant.reflectivity == _LEAF)
 
 
 def conifer(rng: np.random.Generator, height: float) -> Mesh:

@@ -17,6 +17,11 @@ def make_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
     return _SHAPES[kind](rng)
 
 
+def parked_vehicle(rng: np.random.Generator) -> Mesh:
+    """Return what stands at a kerb: a car or, less often, a van."""
+    return make_vehicle("van" if rng.random() < 0.15 else "car", rng)
+
+
 def _some_car(rng: np.random.Generator) -> Mesh:
     return car(float(rng.uniform(0.88, 1.08)), float(rng.uniform(0.1, 0.8)))
 

@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from lifelong_slam.simulation.actors import Actor, make_actors
-from lifelong_slam.simulation.campaign import Campaign, Segment
+from lifelong_slam.simulation.campaign import Campaign, Segment, Traffic
 from lifelong_slam.simulation.highway import highway_site, ramp_site
-from lifelong_slam.simulation.mesh import Mesh
+from lifelong_slam.simulation.mesh import Mesh, merge
 from lifelong_slam.simulation.motion import VehicleMotion
 from lifelong_slam.simulation.routes import Path
+from lifelong_slam.simulation.seasons import Movable, take_movables
 from lifelong_slam.simulation.seeds import generator
 from lifelong_slam.simulation.site import Site
 from lifelong_slam.simulation.terrain import Terrain
@@ -24,22 +27,29 @@ class World:
     """All that sensors can see, and how the car moves through it.
 
     Attributes:
-        static: everything that doesn't move.
+        static: everything that doesn't move while it is looked at.
         actors: everything that does.
         motion: of the car.
+        movables: what is not there in every session; their triangles are the last of `static`.
     """
 
     static: Mesh
     actors: list[Actor]
     motion: VehicleMotion
+    movables: list[Movable]
 
 
 def make_world(campaign: Campaign) -> World:
     """Build the world of a campaign; the same campaign gives the same world."""
     path, terrain, motion = make_route(campaign)
     site, roads = _make_site(campaign, path, terrain)
-    actors = make_actors(campaign.traffic, roads, terrain, generator(campaign.seed, "traffic"))
-    return World(site.build(), actors, motion)
+    rng = campaign.generator("traffic")
+    actors = make_actors(_streams(campaign, path, rng), roads, terrain, rng)
+    if campaign.session is None:
+        return World(site.build(), actors, motion, [])
+    movables = take_movables(site, campaign.seed, campaign.session)
+    static = merge([site.build(), *(movable.mesh for movable in movables)])
+    return World(static, actors, motion, movables)
 
 
 def make_route(campaign: Campaign) -> tuple[Path, Terrain, VehicleMotion]:
@@ -54,12 +64,21 @@ def make_route(campaign: Campaign) -> tuple[Path, Terrain, VehicleMotion]:
     motion = VehicleMotion(
         path,
         terrain,
-        distance=path.length * campaign.laps,
+        distance=path.length * campaign.laps + campaign.overlap,
+        start=campaign.start,
         speed=campaign.speed,
         wobble=campaign.wobble,
-        rng=generator(campaign.seed, "motion"),
+        rng=campaign.generator("motion"),
     )
     return path, terrain, motion
+
+
+def _streams(campaign: Campaign, path: Path, rng: np.random.Generator) -> list[Traffic]:
+    """Return the traffic, which in each session is somewhere else along the route."""
+    if campaign.session is None:
+        return list(campaign.traffic)
+    shift = float(rng.uniform(0, path.length))
+    return [s.model_copy(update={"first": s.first + shift}) for s in campaign.traffic]
 
 
 def _make_site(campaign: Campaign, path: Path, terrain: Terrain) -> tuple[Site, dict[str, Path]]:
