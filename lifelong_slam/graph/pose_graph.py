@@ -1,20 +1,24 @@
 """A pose graph over keyframes, optimised by GTSAM, that no single loop closure can bend.
 
-Odometry edges are trusted. Loop closures are put to the vote by graduated non-convexity (Yang et al.,
-*Graduated non-convexity for robust spatial perception*, RA-L 2020): it starts from the convex problem, in
-which a true closure may move the map by metres, and sharpens until each closure is either in or out.
-That costs several ordinary optimisations, so it is done only when a closure disagrees with the current
-estimate; one that agrees is simply added.
+Odometry edges are trusted, loop closures are not. A new one that the others can't live with is set aside.
+When several have been, all closures, old and new, are put to the vote by graduated non-convexity (Yang et
+al., *Graduated non-convexity for robust spatial perception*, RA-L 2020): it starts from the convex problem,
+in which a true closure may move the map by metres, and sharpens until each closure is either in or out.
+
+Vertices can be removed: what their edges said is then put in by whoever removes them (marginalisation.py).
+A graph may have several components, one for each session that hasn't been located in the map; each is
+held by its root, the vertex that was added without an edge.
 """
 
 import logging
+from collections.abc import Iterable, Set
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from lifelong_slam.geometry import invert, log
+from lifelong_slam.geometry import invert
 from lifelong_slam.result import Edge, GraphSnapshot
 
 Array = NDArray[np.float64]
@@ -22,37 +26,57 @@ logger = logging.getLogger(__name__)
 
 INLIER_PROBABILITY = 0.999  # share of true closures whose error lies below the threshold
 _THRESHOLD = float(chi2.ppf(INLIER_PROBABILITY, 6))
-_GAUGE_SIGMA = 1e-6  # m and rad; the first vertex defines the map frame
+_SEVERAL = 3  # loop closures set aside since the last vote that call for another
+_NEWS = 0.2  # metres; less doesn't mislead the search for loop closures
+_GAUGE_SIGMA = 1e-6  # m and rad; the root defines the frame
 
 
 class PoseGraph:
-    """Vertices with poses, and the measured edges between them."""
+    """Vertices with poses, and what was measured between them."""
 
     def __init__(self) -> None:
         self._values = gtsam.Values()
-        self._ids: list[int] = []
-        self._edges: list[Edge] = []
-        self._factors: list[gtsam.NonlinearFactor] = []
-        self._rejected: set[int] = set()  # indices into edges
-        self._solved: set[int] = set()  # loop closures that the current poses are the optimum of
+        self._roots: list[int] = []
+        self._joined = False  # a root was given up for a loop closure
+        self._incident: dict[int, set[int]] = {}  # keys of factors by vertex
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}
+        self._edges: dict[int, Edge] = {}  # keys as above; factors over many vertices aren't edges
+        self._loops: set[int] = set()
+        self._rejected: set[int] = set()
+        self._new: set[int] = set()  # loop closures since the last optimisation
+        self._outvoted = 0  # number of them at the last vote
+        self._next_key = 0
 
     def __len__(self) -> int:
-        return len(self._ids)
+        return len(self._incident)
+
+    def __contains__(self, vertex: int) -> bool:
+        return vertex in self._incident
+
+    @property
+    def vertices(self) -> list[int]:
+        """Vertices in the order in which they were added."""
+        return list(self._incident)
+
+    @property
+    def roots(self) -> list[int]:
+        """Vertices that hold a component in place, oldest first."""
+        return list(self._roots)
 
     @property
     def edges(self) -> list[Edge]:
         """Edges in use: all odometry, and the loop closures that the last vote let in."""
-        return [edge for i, edge in enumerate(self._edges) if i not in self._rejected]
+        return [edge for key, edge in self._edges.items() if key not in self._rejected]
 
     @property
     def edge_count(self) -> int:
-        """Number of edges in use."""
-        return len(self._edges) - len(self._rejected)
+        """Number of edges in use, factors over many vertices included."""
+        return len(self._factors) - len(self._rejected)
 
     @property
     def rejected(self) -> list[Edge]:
         """Loop closures that the last vote left out."""
-        return [self._edges[i] for i in sorted(self._rejected)]
+        return [self._edges[key] for key in sorted(self._rejected)]
 
     def pose(self, vertex: int) -> Array:
         """Return the current (4, 4) T_map_vertex."""
@@ -60,77 +84,224 @@ class PoseGraph:
 
     def poses(self) -> dict[int, Array]:
         """Return all current (4, 4) T_map_vertex by vertex."""
-        return {vertex: self.pose(vertex) for vertex in self._ids}
+        return {vertex: self.pose(vertex) for vertex in self._incident}
 
     def snapshot(self) -> GraphSnapshot:
         """Return a copy of the graph as it stands."""
         return GraphSnapshot(self.poses(), self.edges)
 
-    def add_vertex(self, vertex: int, T_map_vertex: Array) -> None:
-        """Add a vertex with its first guess."""
-        self._values.insert(vertex, gtsam.Pose3(T_map_vertex))
-        self._ids.append(vertex)
+    def incident(self, vertex: int) -> list[Edge]:
+        """Return the edges in use that meet in a vertex, in the order in which they were added."""
+        keys = sorted(self._incident[vertex] - self._rejected)
+        return [self._edges[key] for key in keys if key in self._edges]
 
-    def add_edge(self, edge: Edge) -> None:
-        """Add a measurement between two vertices that are there already."""
-        noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
-        measurement = gtsam.Pose3(edge.T_source_target)
-        self._edges.append(edge)
-        self._factors.append(gtsam.BetweenFactorPose3(edge.source, edge.target, measurement, noise))
+    def between(self, first: int, second: int) -> list[Edge]:
+        """Return the edges in use between two vertices."""
+        keys = sorted((self._incident[first] & self._incident[second]) - self._rejected)
+        return [self._edges[key] for key in keys if key in self._edges]
+
+    def add_vertex(self, vertex: int, T_map_vertex: Array) -> None:
+        """Add a vertex that no edge leads to: the first of a session, where its frame begins."""
+        self._insert(vertex, T_map_vertex)
+        self._roots.append(vertex)
 
     def add_odometry(self, edge: Edge) -> None:
         """Add a vertex at the end of a measured motion from an existing one, and the motion."""
-        self.add_vertex(edge.target, self.pose(edge.source) @ edge.T_source_target)
+        self._insert(edge.target, self.pose(edge.source) @ edge.T_source_target)
         self.add_edge(edge)
 
-    def disagreement(self, edge: Edge) -> float:
-        """Return the squared Mahalanobis distance of an edge from the current estimate."""
-        expected = invert(self.pose(edge.source)) @ self.pose(edge.target)
-        error = log(invert(edge.T_source_target) @ expected)
-        return float(error @ np.linalg.solve(edge.covariance, error))
+    def add_edge(self, edge: Edge, derived: bool = False) -> None:
+        """Add a measurement between two vertices that are there already.
 
-    def agrees(self, edge: Edge) -> bool:
-        """Tell whether an edge is as near to the current estimate as true edges are."""
-        return self.disagreement(edge) <= _THRESHOLD
+        Args:
+            edge: the measurement.
+            derived: it says what edges that were in use said, and isn't news to the poses.
+        """
+        noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+        measurement = gtsam.Pose3(edge.T_source_target)
+        key = self._add(
+            gtsam.BetweenFactorPose3(edge.source, edge.target, measurement, noise),
+            (edge.source, edge.target),
+        )
+        self._edges[key] = edge
+        if edge.kind == "loop":
+            self._loops.add(key)
+            if not derived:
+                self._new.add(key)
+
+    def remove_edge(self, edge: Edge) -> None:
+        """Forget a measurement."""
+        for key in self._incident[edge.source] & self._incident[edge.target]:
+            if self._edges.get(key) is edge:
+                self._forget(key)
+                return
+        raise KeyError(f"no such edge: {edge.source} -> {edge.target}")
+
+    def remove_vertex(self, vertex: int) -> list[Edge]:
+        """Forget a vertex and all edges that meet in it, and return those.
+
+        Raises:
+            ValueError: the vertex is a root, without which its component has no place.
+        """
+        if vertex in self._roots:
+            raise ValueError(f"vertex {vertex} holds its component in place")
+        edges = [self._edges[key] for key in sorted(self._incident[vertex]) if key in self._edges]
+        for key in list(self._incident[vertex]):
+            self._forget(key)
+        del self._incident[vertex]
+        self._values.erase(vertex)
+        return edges
+
+    def conditional(self, vertex: int) -> tuple[list[int], Array]:
+        """Return how a vertex follows its neighbours, to first order at the current estimate.
+
+        Returns:
+            The k neighbours, and (k, 6, 6) gains: where these move by Exp(d_i) on their right, the
+            optimum of the vertex moves by Exp(sum over i of gain_i d_i).
+        """
+        local = gtsam.NonlinearFactorGraph()
+        for key in sorted(self._incident[vertex] - self._rejected):
+            local.push_back(self._factors[key])
+        neighbours = [v for v in sorted(local.keyVector()) if v != vertex]
+        ordering = gtsam.Ordering()
+        for v in (vertex, *neighbours):
+            ordering.push_back(v)
+        H, _ = local.linearize(self._values).hessian(ordering)
+        gains = -np.linalg.solve(H[:6, :6], H[:6, 6:]).astype(np.float64)
+        return neighbours, gains.reshape(6, -1, 6).swapaxes(0, 1)
+
+    def marginalise_densely(self, vertex: int) -> None:
+        """Remove a vertex; its Schur complement stays as one factor over all its neighbours.
+
+        The factor is linearised at the current estimate, for good.
+        """
+        local = gtsam.NonlinearFactorGraph()
+        keys = sorted(self._incident[vertex] - self._rejected)
+        for key in keys:
+            local.push_back(self._factors[key])
+        ordering = gtsam.Ordering()
+        ordering.push_back(vertex)
+        _, marginal = local.linearize(self._values).eliminatePartialSequential(ordering)
+        around = {v for key in keys for v in _vertices(self._factors[key])} - {vertex}
+        factors = [
+            gtsam.LinearContainerFactor(marginal.at(i), self._values)
+            for i in range(marginal.size())
+        ]
+        self.remove_vertex(vertex)
+        for factor in factors:
+            self._add(factor, around)
+
+    def component(self, vertex: int) -> Set[int]:
+        """Return all vertices that edges in use connect with a vertex, itself included."""
+        if len(self._roots) == 1 and not self._joined:
+            return self._incident.keys()
+        seen, front = {vertex}, [vertex]
+        while front:
+            for key in self._incident[front.pop()] - self._rejected:
+                for other in _vertices(self._factors[key]):
+                    if other not in seen:
+                        seen.add(other)
+                        front.append(other)
+        return seen
+
+    def join(self, edge: Edge) -> None:
+        """Add the loop closure that locates the target's component in the source's.
+
+        The target's component is moved as a whole to where the closure puts it.
+        """
+        shift = self.pose(edge.source) @ edge.T_source_target @ invert(self.pose(edge.target))
+        moved = self.component(edge.target)
+        for vertex in moved:
+            self._values.update(vertex, gtsam.Pose3(shift @ self.pose(vertex)))
+        self._roots = [root for root in self._roots if root not in moved]
+        self._joined = True
+        self.add_edge(edge)
+
+    def is_news(self, edge: Edge) -> bool:
+        """Tell whether a measurement misses the current estimate by so much that it can't wait."""
+        expected = invert(self.pose(edge.source)) @ self.pose(edge.target)
+        return bool(np.linalg.norm((expected - edge.T_source_target)[:3, 3]) > _NEWS)
+
+    def chi_square(self) -> float:
+        """Return the sum of squared Mahalanobis distances of all edges in use."""
+        return self._cost(self._loops - self._rejected)
 
     def optimise(self, reconsider: bool = False) -> None:
         """Find the poses that fit the edges best.
 
         Args:
-            reconsider: put all loop closures to the vote again, those outvoted before included;
-                otherwise they vote only if one of those in use disagrees with the optimum.
+            reconsider: put all loop closures to the vote if any is set aside; otherwise they vote
+                only if several have been since the last vote.
         """
-        loops = {i for i, edge in enumerate(self._edges) if edge.kind == "loop"}
-        before, solved = self._values, self._solved - self._rejected
-        if not (reconsider and self._rejected):
-            used = loops - self._rejected
-            # What the new closures cost all edges together: a lone one that is wrong bends a long
-            # chain of odometry without any single edge, itself included, standing out.
-            rise = -self._cost(solved)
-            self._solve(used)
-            rise += self._cost(used)
-            undisputed = all(self.agrees(self._edges[i]) for i in used)
-            if undisputed and rise <= _THRESHOLD * max(len(used - solved), 1):
+        new = self._new - self._rejected
+        established = self._loops - self._rejected - new
+        before = self._values
+        if not (reconsider and self._rejected) and self._accept(new, established):
+            return
+        if established and new and not reconsider:
+            accepted = set(established)
+            for key in sorted(new):
+                self._values = before
+                if self._accept({key}, accepted):
+                    accepted.add(key)
+                    before = self._values
+            self._values, self._rejected = before, self._loops - accepted
+            if len(self._rejected) - self._outvoted < _SEVERAL:
+                self._solve(accepted)
+                logger.info("%d loop closures are set aside", len(self._rejected))
                 return
-        self._vote(loops)
-        self._solve(loops - self._rejected)
-        self._choose(loops, before, solved)
+        self._vote(before, established)
 
-    def _choose(self, loops: set[int], before: gtsam.Values, solved: set[int]) -> None:
-        """Go back to the closures from before the vote where all edges together fit better so.
+    def _accept(self, new: set[int], established: set[int]) -> bool:
+        """Solve with new loop closures, and tell whether all of them fit together."""
+        # What the new closures cost all edges together: a lone one that is wrong bends a long chain
+        # of odometry without any single edge, itself included, standing out.
+        used = established | new
+        rise = -self._cost(established)
+        self._solve(used)
+        rise += self._cost(used)
+        return self._undisputed(used) and rise <= _THRESHOLD * max(len(new), 1)
+
+    def _insert(self, vertex: int, T_map_vertex: Array) -> None:
+        self._values.insert(vertex, gtsam.Pose3(T_map_vertex))
+        self._incident[vertex] = set()
+
+    def _add(self, factor: gtsam.NonlinearFactor, vertices: Iterable[int]) -> int:
+        key = self._next_key
+        self._next_key += 1
+        self._factors[key] = factor
+        for vertex in vertices:
+            self._incident[vertex].add(key)
+        return key
+
+    def _forget(self, key: int) -> None:
+        for vertex in _vertices(self._factors.pop(key)):
+            self._incident[vertex].discard(key)
+        self._edges.pop(key, None)
+        for keys in (self._loops, self._rejected, self._new):
+            keys.discard(key)
+        self._outvoted = min(self._outvoted, len(self._rejected))
+
+    def _undisputed(self, loops: set[int]) -> bool:
+        """Tell whether all of the given loop closures are as near to the estimate as true ones."""
+        return all(2 * self._factors[key].error(self._values) <= _THRESHOLD for key in loops)
+
+    def _vote(self, before: gtsam.Values, established: set[int]) -> None:
+        """Decide which loop closures are in, those from before or those that non-convexity picks.
 
         Non-convexity is graduated by each closure's own residual, which a long chain of odometry can
         absorb; the truncated squares that the vote means to minimise also count what that costs.
         """
-        voted, values, rejected = loops - self._rejected, self._values, self._rejected
-        objective = self._cost(voted) + _THRESHOLD * len(rejected)
-        self._values = before
-        self._solve(solved)
-        if self._cost(solved) + _THRESHOLD * len(loops - solved) < objective:
-            self._rejected = loops - solved
-            logger.info("%d of %d loop closures are outvoted", len(self._rejected), len(loops))
-        else:
-            self._values, self._rejected, self._solved = values, rejected, voted
+        candidates = []
+        for loops, start in ((self._graduated(before), self._values), (established, before)):
+            self._values = start
+            self._solve(loops)
+            objective = self._cost(loops) + _THRESHOLD * len(self._loops - loops)
+            candidates.append((objective, loops, self._values))
+        _, loops, self._values = min(candidates, key=lambda candidate: candidate[0])
+        self._rejected = self._loops - loops
+        self._outvoted = len(self._rejected)
+        logger.info("%d of %d loop closures are outvoted", self._outvoted, len(self._loops))
 
     def _cost(self, loops: set[int]) -> float:
         """Return the sum of squared Mahalanobis distances with the given loop closures."""
@@ -140,31 +311,51 @@ class PoseGraph:
         """Run Levenberg-Marquardt with the given loop closures."""
         graph = self._nonlinear_graph(loops)
         self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm()).optimize()
-        self._solved = set(loops)
+        self._new -= loops
 
-    def _vote(self, loops: set[int]) -> None:
-        """Decide which loop closures are in by graduated non-convexity."""
+    def _graduated(self, before: gtsam.Values) -> set[int]:
+        """Return the loop closures that graduated non-convexity lets in; poses follow."""
+        self._values = before
+        self._solve(self._loops)
+        graph = self._nonlinear_graph(self._loops)
+        gauges = graph.size() - len(self._factors)
+        keys = dict(enumerate(self._factors, start=gauges))
         params = gtsam.GncLMParams(_lm())
         params.setLossType(gtsam.GncLossType.TLS)
-        # Factor 0 is the gauge, and factor i + 1 is edge i, as all edges take part.
-        params.setKnownInliers([0, *(i + 1 for i in range(len(self._edges)) if i not in loops)])
-        optimiser = gtsam.GncLMOptimizer(self._nonlinear_graph(loops), self._values, params)
+        known = [i for i, key in keys.items() if key not in self._loops]
+        params.setKnownInliers([*range(gauges), *known])
+        optimiser = gtsam.GncLMOptimizer(graph, self._values, params)
         optimiser.setInlierCostThresholdsAtProbability(INLIER_PROBABILITY)
         self._values = optimiser.optimize()
-        weights = np.asarray(optimiser.getWeights())[1:]
-        self._rejected = {i for i in loops if weights[i] < 0.5}
-        logger.info("%d of %d loop closures are outvoted", len(self._rejected), len(loops))
+        weights = np.asarray(optimiser.getWeights())
+        return {key for i, key in keys.items() if key in self._loops and weights[i] >= 0.5}
 
     def _nonlinear_graph(self, loops: set[int]) -> gtsam.NonlinearFactorGraph:
-        """Collect the gauge, all odometry and the given loop closures."""
+        """Collect the gauges, all that is trusted and the given loop closures."""
         graph = gtsam.NonlinearFactorGraph()
-        first = self._ids[0]
-        gauge = gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)
-        graph.push_back(gtsam.PriorFactorPose3(first, self._values.atPose3(first), gauge))
-        for i, factor in enumerate(self._factors):
-            if i in loops or self._edges[i].kind == "odometry":
+        for root in self._gauges():
+            gauge = gtsam.noiseModel.Isotropic.Sigma(6, _GAUGE_SIGMA)
+            graph.push_back(gtsam.PriorFactorPose3(root, self._values.atPose3(root), gauge))
+        for key, factor in self._factors.items():
+            if key in loops or key not in self._loops:
                 graph.push_back(factor)
         return graph
+
+    def _gauges(self) -> list[int]:
+        """Return the roots, and a vertex of each part that closures set aside have cut off."""
+        gauges = list(self._roots)
+        if self._joined:
+            placed = set().union(*(self.component(root) for root in gauges))
+            for vertex in self._incident:
+                if vertex not in placed:
+                    gauges.append(vertex)
+                    placed |= self.component(vertex)
+        return gauges
+
+
+def _vertices(factor: gtsam.NonlinearFactor) -> list[int]:
+    vertices: list[int] = factor.keys()
+    return vertices
 
 
 def _lm() -> gtsam.LevenbergMarquardtParams:

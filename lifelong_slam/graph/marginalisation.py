@@ -1,0 +1,248 @@
+"""Removing a vertex: what its edges said about its neighbours, said by edges among those.
+
+In a vertex's own frame its edges are the arms of a star: arm i says where neighbour i is, with
+information L_i. With S the sum of all, eliminating the vertex leaves the neighbours with the information
+matrix whose block between i and j is -L_i S^-1 L_j (the Schur complement). Where the L_i commute that is
+exactly the matrix of independent edges between all pairs, i to j with information L_i S^-1 L_j: the
+star-mesh transform of electrical networks, in which every measurement is spent once. `StarMesh` builds on
+it; `ChowLiu` and `Dense` are what the literature does.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from lifelong_slam.geometry import adjoint
+from lifelong_slam.graph.edges import fuse, kind_of, outward
+from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.result import Edge
+
+Array = NDArray[np.float64]
+
+_LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: keeps it invertible
+
+
+class Marginalisation(Protocol):
+    """Removes vertices from a graph and keeps what was measured through them."""
+
+    def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
+        """Remove a vertex.
+
+        Args:
+            graph: changed in place.
+            vertex: not a root of the graph.
+            lasting: vertices that are going to stay; new edges had better end there.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StarMesh:
+    """Edges among neighbours that spend each measurement once and stay few.
+
+    The strongest arms become a mesh: all pairs of them, with the information of the Schur complement.
+    Each weaker arm is chained to the strongest one that ends at a lasting vertex: compared with its own
+    uncertainty that one's hardly counts. An edge between two that have one already is fused with it.
+
+    An edge that any loop closure went into is a loop closure, which the graph can outvote. Odometry
+    is chained with odometry only, so that the path of odometry through all vertices remains: it keeps the
+    graph connected whatever is outvoted.
+
+    A vertex that ends up with too many edges loses the loop closures that are worth least: those between
+    vertices that a third one ties together more firmly than they do.
+
+    Attributes:
+        arms: how many of the strongest arms are meshed.
+        max_edges: at a vertex.
+    """
+
+    arms: int = 6
+    max_edges: int = 24
+
+    def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
+        """Remove a vertex; see Marginalisation."""
+        star = _Star(_parallel_fused(graph.incident(vertex), vertex))
+        graph.remove_vertex(vertex)
+        strong, weak = self._split(star)
+        edges = _mesh(star.subset(strong))
+        if weak:
+            hub = _hub(star, strong, lasting)
+            edges += [star.chained(i, hub) for i in weak]
+        for edge in edges:
+            if edge.source != edge.target:
+                _add_fused(graph, edge)
+        for end in {arm.target for arm in star.arms}:
+            _drop_least_worth(graph, end, self.max_edges)
+
+    def _split(self, star: "_Star") -> tuple[list[int], list[int]]:
+        """Return the arms to mesh, odometry always among them, and the others."""
+        order = sorted(
+            range(len(star)), key=lambda i: (star.arms[i].kind == "loop", -star.shares[i])
+        )
+        odometry = sum(arm.kind == "odometry" for arm in star.arms)
+        count = max(self.arms, odometry)
+        return order[:count], order[count:]
+
+
+@dataclass(frozen=True, slots=True)
+class ChowLiu:
+    """The tree among the neighbours that is nearest to the Schur complement.
+
+    Kretzschmar and Stachniss, *Information-theoretic compression of pose graphs for laser-based SLAM*
+    (IJRR 2012): of all trees, the one of most mutual information (Chow and Liu 1968); its edges have the
+    relative covariances of the exact marginal, the optimum for a tree (Mazuran, Burgard and Tipaldi,
+    *Nonlinear factor recovery for long-term SLAM*, IJRR 2016). An edge that comes of odometry alone
+    remains odometry, all others count as loop closures.
+    """
+
+    def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
+        """Remove a vertex; see Marginalisation."""
+        star = _Star(_parallel_fused(graph.incident(vertex), vertex))
+        graph.remove_vertex(vertex)
+        if len(star) < 2:
+            return
+        # Between the ends of two arms nothing but these arms says anything, so that the covariance
+        # of the pair is their sum, and the most mutual information is the least of its determinant.
+        covariances = star.covariances[:, None] + star.covariances[None]
+        entropy = np.linalg.slogdet(covariances)[1]
+        weights = np.triu(entropy - entropy.min() + 1.0, 1)
+        tree = minimum_spanning_tree(weights).tocoo()
+        for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True):
+            if star.arms[i].target != star.arms[j].target:
+                _add_fused(graph, star.chained(i, j))
+
+
+@dataclass(frozen=True, slots=True)
+class Dense:
+    """The Schur complement as it is: one factor over all neighbours, linearised for good."""
+
+    def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
+        """Remove a vertex; see Marginalisation."""
+        graph.marginalise_densely(vertex)
+
+
+class _Star:
+    """The edges that meet in a vertex, outward, with their errors in its frame."""
+
+    def __init__(self, arms: list[Edge]) -> None:
+        self.arms = arms
+        A = np.array([adjoint(arm.T_source_target) for arm in arms]).reshape(-1, 6, 6)
+        covariances = np.array([arm.covariance for arm in arms]).reshape(-1, 6, 6)
+        self.covariances = A @ covariances @ np.swapaxes(A, 1, 2)
+        self.information = np.linalg.inv(self.covariances)
+        # Share of each arm in all that is known about the vertex; they sum to 1.
+        total = self.information.sum(0)
+        self.shares = np.trace(np.linalg.solve(total, self.information), axis1=1, axis2=2) / 6
+
+    def __len__(self) -> int:
+        return len(self.arms)
+
+    def subset(self, indices: list[int]) -> "_Star":
+        """Return the star of some of the arms."""
+        return _Star([self.arms[i] for i in indices])
+
+    def chained(self, i: int, j: int) -> Edge:
+        """Return the edge from one neighbour through the vertex to another, both arms in full."""
+        return self.edge(i, j, self.covariances[i] + self.covariances[j])
+
+    def edge(self, i: int, j: int, covariance: Array) -> Edge:
+        """Return an edge between two neighbours, given the covariance in the vertex's frame."""
+        first, second = self.arms[i], self.arms[j]
+        outward = gtsam.Pose3(second.T_source_target)
+        A = outward.inverse().AdjointMap()
+        C = A @ covariance @ A.T
+        return Edge(
+            first.target,
+            second.target,
+            gtsam.Pose3(first.T_source_target).between(outward).matrix(),
+            (C + C.T) / 2,
+            kind_of(first, second),
+        )
+
+
+def _parallel_fused(edges: list[Edge], vertex: int) -> list[Edge]:
+    """Return the edges outward from a vertex, those of one kind to one neighbour fused."""
+    groups: dict[tuple[int, str], list[Edge]] = defaultdict(list)
+    for edge in edges:
+        arm = outward(edge, vertex)
+        groups[arm.target, arm.kind].append(arm)
+    return [fuse(group) for group in groups.values()]
+
+
+def _mesh(star: _Star) -> list[Edge]:
+    """Return the edges between all pairs that the Schur complement of the star amounts to.
+
+    L_i S^-1 L_j is symmetric where the two commute, as they do with two arms; otherwise its symmetric
+    part is taken, in the frame whitened by S, and held positive.
+    """
+    if len(star) <= 2:
+        return [star.chained(0, 1)] if len(star) == 2 else []
+    eigenvalues, V = np.linalg.eigh(star.information.sum(0))
+    whiten = (V / np.sqrt(eigenvalues)) @ V.T
+    shares = whiten @ star.information @ whiten
+    pairs = list(combinations(range(len(star)), 2))
+    i, j = np.array(pairs).T
+    products = shares[i] @ shares[j]
+    worth, U = np.linalg.eigh((products + np.swapaxes(products, 1, 2)) / 2)
+    worth = np.maximum(worth, _LEAST_EIGENVALUE * np.abs(worth).max(axis=1, keepdims=True))
+    root = whiten @ U
+    covariances = (root / worth[:, None]) @ np.swapaxes(root, 1, 2)
+    # As many as there are neighbours but one: the star's own information, no more and no less, on
+    # the average over what the star says.
+    relative = star.covariances[i] + star.covariances[j]
+    spent = np.trace(np.linalg.solve(covariances, relative), axis1=1, axis2=2).sum()
+    covariances *= spent / (6 * (len(star) - 1))
+    return [star.edge(*pair, C) for pair, C in zip(pairs, covariances, strict=True)]
+
+
+def _hub(star: _Star, strong: list[int], lasting: Collection[int]) -> int:
+    """Return the arm that weaker ones are chained to."""
+    stay = [i for i in strong if star.arms[i].target in lasting]
+    return max(stay or strong, key=lambda i: float(star.shares[i]))
+
+
+def _add_fused(graph: PoseGraph, edge: Edge) -> None:
+    """Add an edge, fused with those of its kind that the graph has between the same vertices."""
+    parallel = [e for e in graph.between(edge.source, edge.target) if e.kind == edge.kind]
+    for other in parallel:
+        graph.remove_edge(other)
+    graph.add_edge(fuse([*parallel, edge]), derived=True)
+
+
+def _drop_least_worth(graph: PoseGraph, vertex: int, max_edges: int) -> None:
+    """Drop loop closures from a vertex that has too many edges.
+
+    The worth of an edge is the variance of the best way round over a third vertex relative to its own.
+    """
+    edges = graph.incident(vertex)
+    excess = len(edges) - max_edges
+    if excess <= 0:
+        return
+    direct = _variances(edges, vertex)
+    worth = []
+    for edge in edges:
+        end = edge.target if edge.source == vertex else edge.source
+        onward = _variances(graph.incident(end), end)
+        ways = [direct[k] + onward[k] for k in direct.keys() & onward.keys()]
+        own = float(np.trace(edge.covariance[3:, 3:]))
+        worth.append(np.inf if edge.kind == "odometry" else min(ways, default=np.inf) / own)
+    for i in np.argsort(worth, kind="stable")[:excess]:
+        if np.isfinite(worth[i]):
+            graph.remove_edge(edges[i])
+
+
+def _variances(edges: list[Edge], vertex: int) -> dict[int, float]:
+    """Return the least variance of position, m^2, of the edges from a vertex by their other end."""
+    variances: dict[int, float] = {}
+    for edge in edges:
+        end = edge.target if edge.source == vertex else edge.source
+        variance = float(np.trace(edge.covariance[3:, 3:]))
+        variances[end] = min(variance, variances.get(end, np.inf))
+    return variances

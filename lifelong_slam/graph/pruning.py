@@ -1,0 +1,99 @@
+"""Pruning: the graph grows with the place and not with time.
+
+Kurz, Holoch and Biber, *Geometry-based graph pruning for lifelong SLAM* (IROS 2021): vertices are chosen by
+geometry and marginalised. The newest are left alone until loop closures have had their say about them;
+after that each is settled: it goes, or it stays as long as the optimiser keeps it away from others.
+"""
+
+from collections.abc import Collection
+from typing import Protocol
+
+import networkx
+
+from lifelong_slam.graph.marginalisation import Marginalisation
+from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.graph.removal import Removal, removal_of
+from lifelong_slam.graph.selection import Selection
+
+
+class Pruning(Protocol):
+    """Keeps a growing graph small."""
+
+    def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
+        """Remove what the graph can do without among vertices that left the window of the newest.
+
+        Args:
+            graph: at its optimum; changed in place.
+            vertices: those that left the window since the last call, of one component.
+        """
+        ...
+
+    def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
+        """Remove vertices, once and for all, until `keep` are left or only protected ones."""
+        ...
+
+
+class NoPruning:
+    """Leaves the graph as it is."""
+
+    def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
+        """Remove nothing."""
+        return []
+
+    def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
+        """Remove nothing."""
+        return []
+
+
+class Pruner:
+    """Chooses vertices by one rule and marginalises them by another."""
+
+    def __init__(self, selection: Selection, marginalisation: Marginalisation) -> None:
+        """Set up.
+
+        Args:
+            selection: which vertices go.
+            marginalisation: what becomes of their edges.
+        """
+        self._selection = selection
+        self._marginalisation = marginalisation
+        self._kept: set[int] = set()
+
+    def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
+        """Choose among the given vertices and those that stayed before. See Pruning."""
+        if not vertices:
+            return []
+        connected = graph.component(next(iter(vertices)))  # poses of others are in another frame
+        older = self._kept & connected
+        poses = {vertex: graph.pose(vertex) for vertex in (*sorted(older), *vertices)}
+        fixed = protected(graph)
+        removed = self._selection.settle(poses, set(vertices) - fixed, older - fixed)
+        self._kept = (self._kept | set(vertices)) - set(removed)
+        return self._remove(graph, removed, self._kept)
+
+    def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
+        """Remove down to a number of vertices. See Pruning."""
+        removable = set(graph.vertices) - protected(graph)
+        removed = self._selection.reduce(graph.poses(), removable, len(graph) - keep)
+        return self._remove(graph, removed, set(graph.vertices) - set(removed))
+
+    def _remove(
+        self, graph: PoseGraph, vertices: list[int], lasting: Collection[int]
+    ) -> list[Removal]:
+        removals = []
+        for vertex in vertices:
+            removals.append(removal_of(graph, vertex))
+            self._marginalisation.remove(graph, vertex, lasting)
+        return removals
+
+
+def protected(graph: PoseGraph) -> set[int]:
+    """Return the vertices that hold a graph together.
+
+    These are the roots, which hold a component in its frame, and the articulation vertices in
+    which more than two edges meet: the joints of loops and of sessions. One with two edges is a link of a
+    chain, which marginalisation replaces exactly.
+    """
+    structure = networkx.Graph((e.source, e.target) for e in graph.edges)
+    joints = networkx.articulation_points(structure)
+    return {*graph.roots, *(vertex for vertex in joints if structure.degree(vertex) > 2)}

@@ -1,0 +1,190 @@
+"""Which vertices a pose graph can do without."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+
+_REACH = 3.0  # spacings up to which others count towards a vertex's density
+
+
+class Selection(Protocol):
+    """Chooses vertices to remove."""
+
+    def settle(
+        self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
+    ) -> list[int]:
+        """Choose among vertices that have left the window of the newest.
+
+        Args:
+            poses: (4, 4) T_map_vertex of all that left the window and are still there.
+            new: those of them that left it since the last call and may go.
+            older: those that were kept before and may go; others are protected.
+
+        Returns:
+            Vertices in the order in which they should be removed.
+        """
+        ...
+
+    def reduce(
+        self, poses: Mapping[int, Array], removable: Collection[int], count: int
+    ) -> list[int]:
+        """Choose, once and for all, `count` of the removable vertices, or fewer if they run out."""
+        ...
+
+
+class Geometry:
+    """The densest go first, so that those that stay are spread evenly (Kurz, Holoch and Biber 2021).
+
+    The density of a vertex is scale-invariant, SID(i) = sum over j of 1 / |x_i - x_j|, over the
+    others within three spacings: further away the sum tells how near a vertex is to the map's centre.
+    With a sensor that doesn't see all around, two vertices in one place that look different ways are
+    different views: x has the position and, to scale, the direction of view.
+    """
+
+    def __init__(self, spacing: float, field_of_view: float = 360.0) -> None:
+        """Set up.
+
+        Args:
+            spacing: metres between vertices that stay; each removed one has a neighbour that near.
+            field_of_view: horizontal, degrees; vertices that look half of it apart count as one
+                spacing apart.
+        """
+        self._spacing = spacing
+        half = np.radians(field_of_view) / 2
+        self._view_radius = 0.0 if field_of_view >= 360 else spacing / (2 * np.sin(half / 2))
+
+    def settle(
+        self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
+    ) -> list[int]:
+        """Remove the densest while they have a neighbour within the spacing; see Selection.
+
+        One that was kept goes only if the optimiser moved it within half the spacing of another.
+        """
+        ids = np.array(list(poses))
+        limit = np.where(np.isin(ids, list(older)), self._spacing / 2, 0.0)
+        limit[np.isin(ids, list(new))] = self._spacing
+        density = _Density(self._places(poses), _REACH * self._spacing)
+        return [int(ids[i]) for i in density.thin(limit)]
+
+    def reduce(
+        self, poses: Mapping[int, Array], removable: Collection[int], count: int
+    ) -> list[int]:
+        """Remove the densest first; see Selection."""
+        ids = np.array(list(poses))
+        places = self._places(poses)
+        # The spacing that the others end up with: to the nearest of as many as one has to stand for.
+        share = int(np.ceil(len(ids) / max(len(ids) - count, 1)))
+        neighbours = min(share + 1, len(ids))
+        spacing = float(np.median(cKDTree(places).query(places, k=[neighbours])[0]))
+        density = _Density(places, _REACH * max(spacing, 1e-6))
+        limit = np.where(np.isin(ids, list(removable)), np.inf, 0.0)
+        return [int(ids[i]) for i in density.thin(limit, count)]
+
+    def _places(self, poses: Mapping[int, Array]) -> Array:
+        """Return (n, 6) positions and scaled directions of view."""
+        T = np.array(list(poses.values())).reshape(-1, 4, 4)
+        return np.concatenate([T[:, :3, 3], self._view_radius * T[:, :3, 0]], axis=1)
+
+
+class _Density:
+    """Scale-invariant density of points, kept up to date while they are taken away."""
+
+    def __init__(self, places: Array, reach: float) -> None:
+        pairs = cKDTree(places).sparse_distance_matrix(
+            cKDTree(places), reach, output_type="coo_matrix"
+        )
+        apart = pairs.row != pairs.col
+        row, column = pairs.row[apart], pairs.col[apart]
+        distance = np.maximum(pairs.data[apart], 1e-6)
+        order = np.argsort(row, kind="stable")
+        self._ends = np.searchsorted(row[order], np.arange(len(places) + 1))
+        self._neighbours, self._distances = column[order], distance[order]
+        self._values = np.bincount(row, 1 / distance, minlength=len(places))
+        self._alive = np.ones(len(places), dtype=bool)
+
+    def thin(self, limit: Array, count: int | None = None) -> list[int]:
+        """Take away the densest points that have another one nearer than their limit.
+
+        Args:
+            limit: (n,) metres; zero protects a point.
+            count: how many to take away at most.
+        """
+        candidates = limit > 0
+        removed: list[int] = []
+        while candidates.any() and (count is None or len(removed) < count):
+            densest = int(np.argmax(np.where(candidates, self._values, -1.0)))
+            candidates[densest] = False  # either goes or, as it can only get sparser, stays
+            if np.isinf(limit[densest]) or self._nearest(densest) < limit[densest]:
+                self._take(densest)
+                removed.append(densest)
+        return removed
+
+    def _nearest(self, i: int) -> float:
+        """Return the distance to the nearest point that is still there."""
+        span = slice(self._ends[i], self._ends[i + 1])
+        distances = self._distances[span][self._alive[self._neighbours[span]]]
+        return float(distances.min()) if len(distances) else np.inf
+
+    def _take(self, i: int) -> None:
+        span = slice(self._ends[i], self._ends[i + 1])
+        self._alive[i] = False
+        np.subtract.at(self._values, self._neighbours[span], 1 / self._distances[span])
+
+
+@dataclass(frozen=True, slots=True)
+class Decimate:
+    """Every k-th vertex in time stays.
+
+    Attributes:
+        every: k.
+    """
+
+    every: int = 3
+
+    def settle(
+        self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
+    ) -> list[int]:
+        """Keep the new ones whose number k divides; see Selection."""
+        return [vertex for vertex in sorted(new) if vertex % self.every]
+
+    def reduce(
+        self, poses: Mapping[int, Array], removable: Collection[int], count: int
+    ) -> list[int]:
+        """Keep vertices at equal distances in time; see Selection."""
+        ids = np.array(sorted(removable))
+        kept = max(len(ids) - count, 0)
+        staying = np.round(np.linspace(0, len(ids) - 1, kept)).astype(int)
+        return [int(i) for i in np.delete(ids, staying)]
+
+
+class Random:
+    """Any vertex goes as likely as any other."""
+
+    def __init__(self, keep: float = 1 / 3, seed: int = 0) -> None:
+        """Set up.
+
+        Args:
+            keep: share of the vertices that stay.
+            seed: of the draws.
+        """
+        self._keep = keep
+        self._rng = np.random.default_rng(seed)
+
+    def settle(
+        self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
+    ) -> list[int]:
+        """Draw for each new one; see Selection."""
+        ids = np.array(sorted(new))
+        return [int(i) for i in ids[self._rng.random(len(ids)) >= self._keep]]
+
+    def reduce(
+        self, poses: Mapping[int, Array], removable: Collection[int], count: int
+    ) -> list[int]:
+        """Draw without putting back; see Selection."""
+        return [int(i) for i in self._rng.permutation(sorted(removable))[:count]]
