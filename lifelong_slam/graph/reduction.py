@@ -1,0 +1,150 @@
+"""Reduces a whole pose graph at once: what it was, what it becomes, and what that changed."""
+
+import logging
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import ConfigError
+from lifelong_slam.graph.initialisation import best_start, connected
+from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.graph.pruning import Pruning
+from lifelong_slam.graph.removal import Removal, recover
+from lifelong_slam.result import GraphSnapshot
+
+Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A pose graph at one moment of its reduction.
+
+    Attributes:
+        poses: T_map_vertex (4, 4) of all vertices that the graph ever had, by id.
+        vertices: that it has, lowest first.
+        edges: in use.
+        loops: those of them that are loop closures, or come of some.
+        rejected: loop closures that are outvoted.
+        chi_square: sum of squared Mahalanobis distances of the edges in use.
+        seconds: wall time that it took to come here from the state before.
+    """
+
+    poses: dict[int, Array]
+    vertices: list[int]
+    edges: int
+    loops: int
+    rejected: int
+    chi_square: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """The states of a graph that is optimised, pruned and optimised again.
+
+    Attributes:
+        read: as it was given.
+        optimum: of all its vertices.
+        pruned: the optimum of those that stay; the others follow them.
+        graph: what is left.
+        complete: whether `graph` holds all that is known: it has no place for factors over many vertices.
+    """
+
+    read: State
+    optimum: State
+    pruned: State
+    graph: GraphSnapshot
+    complete: bool
+
+
+def reduce(
+    snapshot: GraphSnapshot, pruning: Pruning, keep: float, robust: bool = True
+) -> Reduction:
+    """Optimise a graph, remove vertices, and optimise what is left.
+
+    Args:
+        snapshot: not changed; its edges need no particular start.
+        pruning: the method.
+        keep: share of the vertices that stay, if no more are needed to hold the graph together.
+        robust: let loop closures vote, and leave out those that don't fit; else all count.
+
+    Raises:
+        ConfigError: the share isn't one, or the graph has no edges.
+    """
+    if not 0 < keep <= 1:
+        raise ConfigError(f"keep is a share of the vertices, above 0 and at most 1, not {keep:g}")
+    if not snapshot.edges:
+        raise ConfigError("the pose graph has no edges: there is nothing to reduce")
+    logger.info("%d vertices, %d edges; optimising ...", len(snapshot.poses), len(snapshot.edges))
+    watch = _Watch()
+    graph = LoadedGraph(snapshot, robust)
+    read = watch.state(graph, [])
+    graph = LoadedGraph(GraphSnapshot(best_start(snapshot), snapshot.edges), robust)
+    graph.optimise()
+    optimum = watch.state(graph, [])
+    left = max(round(keep * len(graph)), 1)
+    logger.info("Optimised in %.1f s; down to %d vertices ...", optimum.seconds, left)
+    removals = pruning.reduce(graph, left)
+    graph.optimise()
+    pruned = watch.state(graph, removals)
+    return Reduction(
+        read, optimum, pruned, graph.snapshot(), complete=graph.edge_count == len(graph.edges)
+    )
+
+
+class LoadedGraph(PoseGraph):
+    """A pose graph that is there as a whole, and didn't grow from its root.
+
+    Vertices keep the poses that they are given, and the lowest of each connected part is held.
+    """
+
+    def __init__(self, snapshot: GraphSnapshot, robust: bool = True) -> None:
+        """Take vertices and edges.
+
+        Args:
+            snapshot: not changed.
+            robust: let loop closures vote; else all count.
+        """
+        super().__init__()
+        self._robust = robust
+        for vertex, T_map_vertex in snapshot.poses.items():
+            self._insert(vertex, T_map_vertex)
+        for edge in snapshot.edges:
+            self.add_edge(edge)
+        odometry = [edge for edge in snapshot.edges if edge.kind == "odometry"]
+        parts = connected(snapshot)
+        self._roots = [min(part) for part in parts]
+        self._joined = len(connected(GraphSnapshot(snapshot.poses, odometry))) > len(parts)
+
+    def optimise(self, reconsider: bool = False) -> None:
+        """Find the poses that fit the edges best; see PoseGraph."""
+        if self._robust:
+            super().optimise(reconsider)
+        else:
+            self._solve(self._loops)
+
+
+class _Watch:
+    """Takes down states and the time between them."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+
+    def state(self, graph: PoseGraph, removals: list[Removal]) -> State:
+        """Take down how a graph stands."""
+        now = time.perf_counter()
+        edges = graph.edges
+        state = State(
+            poses=recover(graph.poses(), removals),
+            vertices=sorted(graph.vertices),
+            edges=graph.edge_count,
+            loops=sum(edge.kind == "loop" for edge in edges),
+            rejected=len(graph.rejected),
+            chi_square=graph.chi_square(),
+            seconds=now - self._last,
+        )
+        self._last = time.perf_counter()
+        return state

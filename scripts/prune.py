@@ -1,0 +1,197 @@
+"""Reduce a pose graph from a g2o file to fewer vertices, and tell what that changes.
+
+    python scripts/prune.py graph=in.g2o out=out.g2o pruning=geometry keep=0.33
+    python scripts/prune.py graph=in.g2o truth=truth.g2o pruning=chow_liu json=figures.json
+
+SE(2) and SE(3) graphs are read; a file without vertices is chained from its edges. The graph is optimised,
+pruned, and optimised again. Settings, with their defaults in conf/prune.yaml:
+
+    graph=FILE           g2o file; edges between a vertex and the next are odometry, unless a comment line
+                         `# loop` or `# odometry` before them says otherwise
+    out=FILE             g2o file to write what is left to, of the same dimension
+    pruning=geometry     none, geometry, decimate, random, chow_liu or dense, of conf/pruning;
+                         pruning.KEY=VALUE changes a setting of it
+    keep=0.3333          share of the vertices that stay
+    truth=FILE           true poses, for the error (APE: RMSE after alignment, in the plane if the graph
+                         is): g2o, edges between true poses (EDGE2, EDGE3), or TUM, a row for each vertex
+    robust=true          let loop closures vote, and leave out those that don't fit; false trusts them all
+    json=FILE            write the figures
+    seed=0               of pruning=random
+    sensor.field_of_view=360  degrees, and sensor.vertex_spacing=1 in metres: with a narrow field of view,
+                         two vertices in one place that look half of it apart count as one spacing apart
+
+Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
+"""
+
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+from rich.table import Table
+
+from console import fail
+from eval.errors import EvalError
+from eval.files import write_json
+from eval.vertices import Array, rmse, vertex_distances
+from lifelong_slam.config import build, check_value
+from lifelong_slam.errors import ConfigError, LifelongSlamError
+from lifelong_slam.graph.reduction import Reduction, State, reduce
+from lifelong_slam.io.g2o import read_g2o, write_g2o
+from lifelong_slam.io.graph_truth import read_truth
+from lifelong_slam.overrides import check_overrides
+from lifelong_slam.provenance import describe_run, seed_everything
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line can say besides the pruning method; see the top of this file."""
+
+    graph: str
+    out: str | None
+    keep: float
+    truth: str | None
+    robust: bool
+    json: str | None
+    seed: int
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Reduce a graph and return the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return 0
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    try:
+        config = compose_config(arguments)
+        facts = prune(parse(config), config, arguments)
+    except KNOWN_ERRORS as error:
+        fail(error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("Stopped: nothing is written.", file=sys.stderr)
+        return INTERRUPTED
+    show(facts)
+    return 0
+
+
+def compose_config(arguments: Sequence[str]) -> DictConfig:
+    """Return the config that a command line asks for.
+
+    Raises:
+        ConfigError: an argument is no setting, or names a method that isn't there.
+    """
+    check_overrides(CONF, arguments, "prune")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config: DictConfig = compose("prune", overrides=[*arguments])
+    return config
+
+
+def parse(config: DictConfig) -> Settings:
+    """Return the checked settings.
+
+    Raises:
+        ConfigError: there is no input, or a value has the wrong type.
+    """
+    types = Settings.__annotations__
+    if not config.get("pruning"):
+        raise ConfigError("nothing is chosen for pruning: give pruning=...")
+    if OmegaConf.is_missing(config, "graph"):
+        raise ConfigError("graph has no value: give a g2o file with graph=...")
+    return Settings(**{key: check_value(key, config.get(key), types[key]) for key in types})
+
+
+def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> dict[str, Any]:
+    """Read, reduce and write a graph, and return the figures."""
+    seed_everything(settings.seed)
+    pruning = build(config.pruning)
+    graph = read_g2o(Path(settings.graph))
+    truth = read_truth(Path(settings.truth), graph.poses) if settings.truth else None
+    result = reduce(graph, pruning, settings.keep, settings.robust)
+    if settings.out:
+        if not result.complete:
+            raise ConfigError(
+                "this method leaves factors over many vertices, which a g2o file can't hold:"
+                " choose another one, or leave out= away"
+            )
+        write_g2o(Path(settings.out), result.graph, graph.planar)
+    facts = {
+        "run": describe_run(arguments, settings.seed),
+        "planar": graph.planar,
+        **figures(result, truth, graph.planar),
+    }
+    if settings.json:
+        write_json(Path(settings.json), facts)
+    return facts
+
+
+def figures(result: Reduction, truth: dict[int, Array] | None, planar: bool) -> dict[str, Any]:
+    """Return what the states of a reduction are like, and how far the last is from the optimum."""
+    stay, every = result.pruned.vertices, result.read.vertices
+
+    def of_state(state: State) -> dict[str, Any]:
+        return {
+            "vertices": len(state.vertices),
+            "edges": state.edges,
+            "loops": state.loops,
+            "rejected": state.rejected,
+            "chi_square": state.chi_square,
+            "seconds": state.seconds,
+            "ape_staying_m": truth and rmse(vertex_distances(state.poses, truth, stay, planar)),
+            "ape_all_m": truth and rmse(vertex_distances(state.poses, truth, every, planar)),
+        }
+
+    optimum, pruned = result.optimum.poses, result.pruned.poses
+    return {
+        "states": {name: of_state(getattr(result, name)) for name in ("read", "optimum", "pruned")},
+        "moved_staying_m": float(vertex_distances(pruned, optimum, stay, planar).mean()),
+        "moved_all_m": float(vertex_distances(pruned, optimum, every, planar).mean()),
+    }
+
+
+def show(facts: dict[str, Any]) -> None:
+    """Print the figures as a table."""
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for column in ("as read", "optimised", "pruned"):
+        table.add_column(column, justify="right")
+    states = facts["states"].values()
+    for name, key, form in _ROWS:
+        values = [state[key] for state in states]
+        if values[0] is not None:
+            table.add_row(name, *(format(value, form) for value in values))
+    console = Console()
+    console.print(table)
+    console.print(
+        f"Mean distance from the optimum: {facts['moved_staying_m']:.4f} m (vertices that stay),"
+        f" {facts['moved_all_m']:.4f} m (all)",
+        soft_wrap=True,
+    )
+
+
+_ROWS = (
+    ("Vertices", "vertices", "d"),
+    ("Edges", "edges", "d"),
+    ("Loop closures", "loops", "d"),
+    ("Rejected", "rejected", "d"),
+    ("Chi-square", "chi_square", ".2f"),
+    ("APE, vertices that stay [m]", "ape_staying_m", ".4f"),
+    ("APE, all vertices [m]", "ape_all_m", ".4f"),
+    ("Seconds", "seconds", ".1f"),
+)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,342 @@
+"""scripts/prune.py as a user meets it, and the parts that it is made of."""
+
+import json
+import os
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from pose_graph_support import gtsam_optimum, laps
+
+import prune
+from eval.vertices import rmse, vertex_distances
+from lifelong_slam.errors import ConfigError, SourceError
+from lifelong_slam.geometry import exp, invert, log, to_quaternion
+from lifelong_slam.graph.initialisation import best_start, chordal
+from lifelong_slam.graph.marginalisation import Dense, StarMesh
+from lifelong_slam.graph.pruning import NoPruning, Pruner
+from lifelong_slam.graph.reduction import LoadedGraph, reduce
+from lifelong_slam.graph.selection import Geometry
+from lifelong_slam.io.g2o import read_g2o, write_g2o
+from lifelong_slam.io.graph_truth import read_truth
+from lifelong_slam.result import Edge, GraphSnapshot
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / os.environ.get("LIFELONG_SLAM_DATA", "../shared/data") / "pose_graphs"
+needs_data = pytest.mark.skipif(
+    not DATA.is_dir(), reason=f"{DATA} is not there (LIFELONG_SLAM_DATA names the data folder)"
+)
+GEOMETRY = Pruner(Geometry(1.0), StarMesh())
+
+
+@pytest.fixture
+def cli(capsys):
+    """Run scripts/prune.py's main; return its status, stdout and stderr."""
+
+    def call(*arguments):
+        status = prune.main([str(argument) for argument in arguments])
+        return status, *capsys.readouterr()
+
+    return call
+
+
+def write_laps(folder, **settings):
+    """Write laps as a g2o file, with the truth as another one, and return their paths."""
+    graph, truth = laps(**settings)
+    planar = settings.get("planar", False)
+    write_g2o(folder / "in.g2o", graph, planar)
+    write_g2o(folder / "truth.g2o", GraphSnapshot(truth, []), planar)
+    return folder / "in.g2o", folder / "truth.g2o"
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_reduces_a_file_and_tells_what_that_changed(cli, tmp_path, planar):
+    graph, truth = write_laps(tmp_path, planar=planar)
+    out, figures = tmp_path / "out.g2o", tmp_path / "figures.json"
+    status, shown, _ = cli(
+        f"graph={graph}", f"out={out}", f"truth={truth}", f"json={figures}", "keep=0.4"
+    )
+    assert status == 0
+    assert "Chi-square" in shown
+    facts = json.loads(figures.read_text())
+    read, optimum, pruned = (facts["states"][name] for name in ("read", "optimum", "pruned"))
+    assert (read["vertices"], optimum["vertices"], pruned["vertices"]) == (60, 60, 24)
+    assert read["edges"] == optimum["edges"] == 99
+    assert optimum["chi_square"] == pytest.approx(
+        2 * gtsam_optimum(graph, spatial=not planar)[0], rel=1e-6
+    )
+    assert optimum["ape_all_m"] < 0.5 * read["ape_all_m"]
+    assert pruned["ape_staying_m"] < 1.3 * optimum["ape_staying_m"]
+    assert facts["moved_all_m"] < 0.5 * optimum["ape_all_m"]
+    written, values = gtsam.readG2o(str(out), not planar)
+    assert (values.size(), written.size()) == (24, pruned["edges"])
+    assert 2 * written.error(values) == pytest.approx(pruned["chi_square"], rel=1e-3)
+    assert read_g2o(out).planar == planar
+
+
+def test_a_written_graph_can_be_reduced_again(cli, tmp_path):
+    graph, _ = write_laps(tmp_path, planar=True)
+    for keep, left in ((0.5, 30), (0.5, 15)):
+        out = tmp_path / f"{left}.g2o"
+        assert cli(f"graph={graph}", f"out={out}", f"keep={keep}")[0] == 0
+        assert len(read_g2o(out).poses) == left
+        graph = out
+
+
+def test_without_pruning_the_optimum_comes_back(cli, tmp_path):
+    graph, _ = write_laps(tmp_path)
+    cli(f"graph={graph}", f"out={tmp_path / 'out.g2o'}", "pruning=none")
+    _, poses = gtsam_optimum(graph, spatial=True)
+    for i, pose in read_g2o(tmp_path / "out.g2o").poses.items():
+        np.testing.assert_allclose(pose, poses[i], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["keep=0"], "above 0 and at most 1"),
+        (["keep=1.01"], "above 0 and at most 1"),
+        (["keep=some"], "keep: .* valid number"),
+        (["keep=0.2,0.3"], "'keep=0.2,0.3'"),
+        (["kep=0.3"], "Did you mean 'keep'"),
+        (["pruning=geometri"], "Did you mean 'geometry'"),
+        (["pruning.marginalisation.arms=many"], "arms: .* valid integer"),
+        (["graph=missing.g2o"], "no such pose graph: missing.g2o"),
+        (["truth=missing.tum"], "no such file"),
+        (["pruning=dense"], "can't hold"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(
+    cli, tmp_path, arguments, message
+):
+    graph, _ = write_laps(tmp_path, count=2)
+    out = tmp_path / "out.g2o"
+    out.write_text("old")
+    status, shown, said = cli(f"graph={graph}", f"out={out}", *arguments)
+    assert (status, shown) == (2, "")
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    with pytest.raises(AssertionError, match=message):  # shows the line if it doesn't match
+        raise AssertionError(errors[0])
+    assert out.read_text() == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {"in.g2o", "truth.g2o", "out.g2o"}
+
+
+def test_the_input_must_be_named(cli):
+    status, _, said = cli("keep=0.5")
+    assert status == 2
+    assert "graph=" in said
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_the_middle_of_a_chain_becomes_the_sum_of_its_edges(planar):
+    graph, _ = laps(planar=planar, count=2)
+    first, second = graph.edges[:2]
+    chain = GraphSnapshot({i: graph.poses[i] for i in range(3)}, [first, second])
+    result = reduce(chain, GEOMETRY, keep=2 / 3)
+    (edge,) = result.graph.edges
+    assert (edge.source, edge.target, edge.kind) == (0, 2, "odometry")
+    assert result.pruned.chi_square == pytest.approx(0, abs=1e-9)
+    T = first.T_source_target @ second.T_source_target
+    np.testing.assert_allclose(edge.T_source_target, T, atol=1e-9)
+    A = np.asarray(gtsam.Pose3(invert(second.T_source_target)).AdjointMap())
+    expected = A @ first.covariance @ A.T + second.covariance
+    np.testing.assert_allclose(edge.covariance, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_a_graph_whose_vertices_say_nothing_finds_its_optimum():
+    """From poses that are all the same, Levenberg-Marquardt alone ends in another minimum."""
+    graph, truth = laps(seed=4)
+    nowhere = GraphSnapshot(dict.fromkeys(graph.poses, np.eye(4)), graph.edges)
+    alone = LoadedGraph(nowhere, robust=False)
+    alone.optimise()
+    result = reduce(nowhere, NoPruning(), keep=1.0)
+    assert alone.chi_square() > 10 * result.optimum.chi_square
+    assert rmse(vertex_distances(result.optimum.poses, truth, truth)) < 0.2
+
+
+def test_wrong_closures_neither_choose_the_start_nor_bend_the_map():
+    graph, truth = laps(seed=1, planar=True, wrong=10)
+    assert best_start(graph) is graph.poses
+    robust = reduce(graph, GEOMETRY, keep=0.4)
+    trusting = reduce(graph, GEOMETRY, keep=0.4, robust=False)
+    assert (robust.optimum.rejected, trusting.optimum.rejected) == (10, 0)
+    for state, least, most in ((robust, 0.0, 0.1), (trusting, 1.0, np.inf)):
+        error = rmse(vertex_distances(state.pruned.poses, truth, truth, planar=True))
+        assert least < error < most
+
+
+def test_the_chordal_start_is_exact_where_measurements_are():
+    graph, truth = laps()
+    exact = [
+        Edge(e.source, e.target, invert(truth[e.source]) @ truth[e.target], e.covariance, e.kind)
+        for e in graph.edges
+    ]
+    for i, pose in chordal(GraphSnapshot(graph.poses, exact)).items():
+        np.testing.assert_allclose(pose, truth[i], atol=1e-6)
+
+
+def test_parts_without_any_edge_between_them_are_each_held():
+    graph, _ = laps(count=2)
+    shifted = {i + 100: pose for i, pose in graph.poses.items()}
+    more = [
+        Edge(e.source + 100, e.target + 100, e.T_source_target, e.covariance, e.kind)
+        for e in graph.edges
+    ]
+    both = GraphSnapshot(graph.poses | shifted, graph.edges + more)
+    result = reduce(both, GEOMETRY, keep=0.5)
+    single = reduce(graph, NoPruning(), keep=1.0)
+    assert len(result.pruned.vertices) == 40
+    assert {0, 100} <= set(result.pruned.vertices)
+    for i, pose in single.optimum.poses.items():
+        np.testing.assert_allclose(result.optimum.poses[i], pose, atol=1e-6)
+        np.testing.assert_allclose(result.optimum.poses[i + 100], pose, atol=1e-6)
+
+
+def test_sessions_that_only_closures_join_stay_where_the_file_puts_them():
+    """The second session has no odometry from the first: true closures hold it, wrong ones lose."""
+    graph, truth = laps(count=2, wrong=3, seed=2)
+    edges = [edge for edge in graph.edges if (edge.source, edge.target) != (19, 20)]
+    odometry = [edge.kind for edge in edges].count("odometry")
+    result = reduce(GraphSnapshot(truth, edges), GEOMETRY, keep=0.5)
+    assert odometry == 38
+    assert result.optimum.rejected == 3
+    assert rmse(vertex_distances(result.pruned.poses, truth, truth)) < 0.1
+
+
+def test_dense_factors_make_a_reduction_incomplete():
+    graph, _ = laps(count=2)
+    assert not reduce(graph, Pruner(Geometry(1.0), Dense()), keep=0.5).complete
+    assert reduce(graph, GEOMETRY, keep=0.5).complete
+
+
+def test_a_graph_without_edges_is_refused():
+    with pytest.raises(ConfigError, match="no edges"):
+        reduce(GraphSnapshot({}, []), GEOMETRY, keep=0.5)
+
+
+def test_distances_in_the_plane_see_that_a_map_is_mirrored():
+    _, truth = laps(planar=True)
+    lopsided = {i: pose for i, pose in truth.items() if i in (0, 3, 4, 11, 12, 13)}
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    mirrored = {i: mirror @ pose @ mirror for i, pose in lopsided.items()}
+    assert rmse(vertex_distances(mirrored, lopsided, lopsided, planar=True)) > 0.5
+    assert rmse(vertex_distances(mirrored, lopsided, lopsided)) < 1e-9
+
+
+def test_distances_do_not_depend_on_the_frame():
+    _, truth = laps()
+    shift = exp(np.array([0.3, -0.2, 2.0, 10.0, 20.0, 30.0]))
+    moved = {i: shift @ pose for i, pose in truth.items()}
+    moved[5] = moved[5] @ exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1e-6]))
+    distances = vertex_distances(moved, truth, truth)
+    assert distances.argmax() == 5
+    assert distances[5] == pytest.approx(1e-6, rel=0.1)
+
+
+def test_truth_is_read_from_every_kind_of_file(tmp_path):
+    _, truth = laps(count=2)
+    write_g2o(tmp_path / "vertices.g2o", GraphSnapshot(truth, []))
+    edges = [Edge(i, i + 1, invert(truth[i]) @ truth[i + 1], np.eye(6), "loop") for i in range(39)]
+    write_g2o(tmp_path / "edges.g2o", GraphSnapshot({}, edges))
+    with (tmp_path / "edges.txt").open("w") as file:
+        for edge in edges:
+            T = edge.T_source_target
+            rpy = gtsam.Rot3(T[:3, :3]).rpy()
+            row = " ".join(repr(float(value)) for value in [*T[:3, 3], *rpy])
+            file.write(f"EDGE3 {edge.source} {edge.target} {row} 1 0 0\n")
+    with (tmp_path / "rows.tum").open("w") as file:
+        file.write("# stamp x y z qx qy qz qw\n")
+        for i, T in truth.items():
+            row = [0.1 * i, *T[:3, 3], *to_quaternion(T)]
+            file.write(" ".join(repr(float(value)) for value in row) + "\n")
+    for name in ("vertices.g2o", "edges.g2o", "edges.txt", "rows.tum"):
+        poses = read_truth(tmp_path / name, truth)
+        for i, pose in truth.items():
+            np.testing.assert_allclose(poses[i], pose, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "empty"),
+        ("EDGE2 0 1 1 0\n", "line 1: not a valid EDGE2"),
+        ("EDGE2 0 1 1 0 0\nEDGE2 5 6 1 0 0\n", "such as 5"),
+        ("VERTEX_SE2 0 1 2 3\n", "lacks 1 vertices, such as 1"),
+        ("0.0 1 2 3 0 0 0 1\n", "1 rows for 2 vertices"),
+    ],
+)
+def test_truth_that_does_not_fit_is_refused(tmp_path, content, message):
+    (tmp_path / "truth.txt").write_text(content)
+    with pytest.raises(SourceError, match=rf"truth\.txt.*{message}"):
+        read_truth(tmp_path / "truth.txt", [0, 1])
+
+
+@needs_data
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "half"), [("intel", 22.502), ("manhattan3500", 73.039), ("sphere2500", 675.701)]
+)
+def test_public_graphs_reach_the_optimum_of_gtsam(name, half):
+    path = DATA / f"{name}.g2o"
+    graph = read_g2o(path)
+    expected, poses = gtsam_optimum(path, spatial=not graph.planar)
+    assert expected == pytest.approx(half, abs=1e-3)
+    state = reduce(graph, NoPruning(), keep=1.0).optimum
+    assert state.rejected == 0
+    assert state.chi_square / 2 == pytest.approx(half, abs=1e-3)
+    assert vertex_distances(state.poses, poses, poses, graph.planar).max() < 0.02
+
+
+@needs_data
+@pytest.mark.data
+def test_every_true_edge_of_the_sphere_agrees_with_the_chained_truth():
+    """So that the order of roll, pitch and yaw is right: half of the edges aren't in the chain."""
+    graph = read_g2o(DATA / "sphere2500.g2o")
+    path = DATA / "sphere2500_groundtruth.txt"
+    truth = read_truth(path, graph.poses)
+    errors = []
+    for line in path.read_text().splitlines():
+        _, source, target, *numbers = line.split()
+        x, y, z, roll, pitch, yaw = map(float, numbers[:6])
+        T = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([x, y, z])).matrix()
+        errors.append(log(invert(T) @ invert(truth[int(source)]) @ truth[int(target)]))
+    assert len(errors) == 4949
+    assert np.abs(errors).max() < 1e-2
+
+
+@needs_data
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("manhattan3500", "manhattan3500_groundtruth.txt"),
+        ("sphere2500", "sphere2500_groundtruth.txt"),
+        ("intel", None),
+    ],
+)
+def test_public_graphs_keep_their_accuracy_with_a_third_of_their_vertices(name, truth):
+    graph = read_g2o(DATA / f"{name}.g2o")
+    result = reduce(graph, GEOMETRY, keep=1 / 3)
+    stay, pruned, optimum = result.pruned.vertices, result.pruned.poses, result.optimum.poses
+    assert len(stay) == round(len(graph.poses) / 3)
+    if truth is None:
+        assert vertex_distances(pruned, optimum, stay, graph.planar).mean() < 0.03
+    else:
+        true = read_truth(DATA / truth, graph.poses)
+        apes = [rmse(vertex_distances(p, true, stay, graph.planar)) for p in (pruned, optimum)]
+        assert apes[0] < 1.1 * apes[1]
+
+
+@needs_data
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("strictness", ["1.00", "0.25"])
+def test_wrong_closures_of_a_real_drive_are_outvoted(strictness):
+    graph = read_g2o(DATA / f"kitti_00_alpha_{strictness}.g2o")
+    truth = read_truth(DATA / "kitti_00_GT.g2o", graph.poses)
+    result = reduce(graph, GEOMETRY, keep=1 / 3)
+    for state in (result.optimum, result.pruned):
+        assert rmse(vertex_distances(state.poses, truth, truth, planar=True)) < 1.5 * 2.08
