@@ -1,0 +1,59 @@
+"""How far off are the edges that the pipeline measures, odometry and loop closures?
+
+Maps a simulated scenario and compares every edge of the graph with the truth. The root mean squares are the
+noise of the graph-level simulation (`lifelong_slam/simulation/building_run.py`).
+
+    python benchmarks/edge_noise.py [scenario=loop scenario.laps=2 sensor=vls128 ...]
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from hydra import compose, initialize_config_dir
+from numpy.typing import NDArray
+from throughput import markdown
+
+from lifelong_slam.config import build
+from lifelong_slam.geometry import invert, log
+from lifelong_slam.provenance import seed_everything
+from lifelong_slam.result import EdgeKind
+from lifelong_slam.sources.cleaning import InputCounts, clean
+
+Array = NDArray[np.float64]
+CONF = Path(__file__).resolve().parent.parent / "conf"
+DEFAULTS = ("scenario=loop", "scenario.laps=2", "sensor=vls128", "pruning=none")
+
+
+def measure(overrides: Sequence[str]) -> dict[EdgeKind, Array]:
+    """Return (N, 6) errors of the edges of each kind, in the target's frame, rotation then translation."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[*DEFAULTS, *overrides])
+    seed_everything(config.seed)
+    system, source = build(config.system), build(config.scenario)
+    vertices = np.array([system.process(scan).vertices for scan in clean(source, InputCounts())])
+    result = system.finish()
+    keyframes = np.flatnonzero(np.diff(vertices, prepend=0))  # the scans that became one
+    reference = source.reference()
+    stamps = np.clip(result.trajectory.stamps[keyframes], None, reference.stamps[-1])
+    truth = reference.at(stamps) @ source.T_base_sensor
+    errors: dict[EdgeKind, list[Array]] = {"odometry": [], "loop": []}
+    for edge in result.graph.edges:
+        motion = invert(truth[edge.source]) @ truth[edge.target]
+        errors[edge.kind].append(log(invert(motion) @ edge.T_source_target))
+    return {kind: np.array(values) for kind, values in errors.items()}
+
+
+def main() -> None:
+    """Print a Markdown table of root mean square errors by kind and component."""
+    units = ["rx mrad", "ry mrad", "rz mrad", "x mm", "y mm", "z mm"]
+    rows = []
+    for kind, errors in measure(sys.argv[1:]).items():
+        spread = 1e3 * np.sqrt(np.mean(errors**2, axis=0))
+        rows.append([kind, str(len(errors)), *(f"{value:.2f}" for value in spread)])
+    print(markdown(["kind", "edges", *units], rows))
+
+
+if __name__ == "__main__":
+    main()
