@@ -169,6 +169,7 @@ def keyframe(index, T_odom_sensor, points, travelled=None, covariance=None, seco
     points = np.asarray(points, dtype=np.float32).reshape(-1, 3)
     return Keyframe(
         id=index,
+        session=0,
         stamp=START + round((index if seconds is None else seconds) * NANOSECONDS),
         T_odom_sensor=T_odom_sensor,
         covariance=np.diag(SIGMAS**2) if covariance is None else covariance,

@@ -18,6 +18,7 @@ class Keyframe:
 
     Attributes:
         id: vertex id.
+        session: the run that took it, counted within a map.
         stamp: nanoseconds.
         T_odom_sensor: (4, 4) pose by odometry alone.
         covariance: (6, 6) of its registration, in its own frame, rotation then translation.
@@ -27,6 +28,7 @@ class Keyframe:
     """
 
     id: int
+    session: int
     stamp: int
     T_odom_sensor: Array
     covariance: Array

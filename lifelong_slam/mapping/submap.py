@@ -1,0 +1,155 @@
+"""The part of the map that one vertex of the graph carries."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float32]
+Keys = NDArray[np.int64]
+
+LOW, HIGH = -4, 6  # clamps of the score; see `Submap`
+_MAX_WEIGHT = 100  # points in a mean, above which old ones fade
+_KEY_BITS = 21  # a voxel's coordinate; 2^20 voxels of 0.2 m are 210 km
+
+
+def voxel_keys(points: NDArray[np.floating], voxel_size: float) -> Keys:
+    """Return one integer for the voxel of each of (N, 3) points."""
+    cells = np.floor(points / voxel_size).astype(np.int64) + (1 << (_KEY_BITS - 1))
+    return np.asarray(
+        (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2], dtype=np.int64
+    )
+
+
+class Submap:
+    """Voxels in the frame of their owner, so that they go where optimisation moves it.
+
+    A voxel's score counts keyframes that hit it, less those that looked through it, clamped as
+    occupancy is in OctoMap (Hornung et al., Autonomous Robots 2013, eq. 4): what stood for years leaves
+    the map as fast as what stood for a day. A voxel is static while its score isn't negative, so one
+    with score `HIGH` is gone once `HIGH + 1` keyframes have looked through it. At `LOW` it is forgotten.
+
+    Attributes:
+        keys: (N,) int64 voxels, ascending; see `voxel_keys`.
+        means: (N, 3) float32 mean of what was measured in each, metres, owner's frame.
+        weights: (N,) uint8 measurements in the mean, capped.
+        scores: (N,) int8, above `LOW` and up to `HIGH`.
+        bounds: (2, 3) float32 lower and upper corner of a box that holds all means.
+    """
+
+    __slots__ = ("bounds", "keys", "means", "scores", "weights")
+
+    def __init__(
+        self, keys: Keys, means: Points, weights: NDArray[np.uint8], scores: NDArray[np.int8]
+    ) -> None:
+        """Put together copies of what `arrays` gave.
+
+        Raises:
+            ValueError: the arrays' lengths differ, or keys don't ascend.
+        """
+        if means.shape != (len(keys), 3) or not len(keys) == len(weights) == len(scores):
+            raise ValueError("a submap's keys, means, weights and scores must have one length")
+        if np.any(np.diff(keys) <= 0):
+            raise ValueError("a submap's keys must ascend")
+        self.keys, self.means = keys.copy(), means.copy()
+        self.weights, self.scores = weights.copy(), scores.copy()
+        self.bounds = _bounds(means)
+
+    @classmethod
+    def empty(cls) -> "Submap":
+        """Return one without voxels."""
+        means = np.zeros((0, 3), np.float32)
+        return cls(np.zeros(0, np.int64), means, np.zeros(0, np.uint8), np.zeros(0, np.int8))
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return what the constructor takes, by name; they change as the submap does."""
+        return {name: getattr(self, name) for name in ("keys", "means", "weights", "scores")}
+
+    @property
+    def static(self) -> NDArray[np.bool_]:
+        """(N,) whether each voxel is in the map."""
+        return np.asarray(self.scores >= 0)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def contains(self, keys: Keys) -> NDArray[np.bool_]:
+        """Tell which of (M,) keys it has."""
+        return self._find(keys)[1]
+
+    def merge(
+        self,
+        keys: Keys,
+        means: NDArray[np.floating],
+        weights: NDArray[np.integer],
+        scores: NDArray[np.integer],
+    ) -> None:
+        """Join voxels to those there are: means by weight, scores as sums between the clamps.
+
+        Args:
+            keys: (M,) ascending, as are those of the submap.
+            means: (M, 3) in the owner's frame.
+            weights: (M,) measurements in each mean.
+            scores: (M,) what the voxel's score changes by; a new voxel starts from 0.
+        """
+        at, known = self._find(keys)
+        old = at[known]
+        total = self.weights[old].astype(np.int64) + weights[known]
+        step = (means[known] - self.means[old]) * (weights[known] / total)[:, None]
+        self.means[old] += step.astype(np.float32)
+        self.weights[old] = np.minimum(total, _MAX_WEIGHT)
+        self.scores[old] = _clamp(self.scores[old].astype(np.int64) + scores[known])
+        new = ~known
+        if np.any(new):
+            self._insert(at[new], keys[new], means[new], weights[new], _clamp(scores[new]))
+
+    def weaken(self, voxels: NDArray[np.intp]) -> None:
+        """Take one from the scores of voxels (M,), given by index, and forget those at `LOW`."""
+        self.scores[voxels] -= 1
+        dead = voxels[self.scores[voxels] <= LOW]
+        if len(dead):
+            alive = np.delete(np.arange(len(self.keys)), dead)
+            self.keys, self.means = self.keys[alive], self.means.take(alive, axis=0)
+            self.weights, self.scores = self.weights[alive], self.scores[alive]
+
+    def _find(self, keys: Keys) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Return where each of (M,) keys is or would be, and whether it is there."""
+        at = np.searchsorted(self.keys, keys)
+        if not len(self.keys):
+            return at, np.zeros(len(keys), np.bool_)
+        return at, np.asarray(self.keys[np.minimum(at, len(self.keys) - 1)] == keys)
+
+    def _insert(
+        self,
+        at: NDArray[np.intp],
+        keys: Keys,
+        means: NDArray[np.floating],
+        weights: NDArray[np.integer],
+        scores: NDArray[np.integer],
+    ) -> None:
+        order = np.insert(np.arange(len(self.keys)), at, len(self.keys) + np.arange(len(at)))
+
+        def join(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            # `take` moves rows several times faster than indexing does.
+            joined = np.concatenate([old, new.astype(old.dtype)])
+            return np.asarray(joined.take(order, axis=0))
+
+        self.keys = join(self.keys, keys)
+        self.means = join(self.means, means)
+        self.weights = join(self.weights, np.minimum(weights, _MAX_WEIGHT))
+        self.scores = join(self.scores, scores)
+        bounds = _bounds(means)
+        self.bounds = np.stack(
+            [np.minimum(self.bounds[0], bounds[0]), np.maximum(self.bounds[1], bounds[1])]
+        )
+
+
+def _clamp(scores: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Return scores that a voxel which was just measured can have."""
+    return np.clip(scores, LOW + 1, HIGH)
+
+
+def _bounds(means: NDArray[np.floating]) -> Points:
+    """Return the (2, 3) lower and upper corner of a box around (N, 3) points, inside out for none."""
+    limits = [(c.min(), c.max()) if len(c) else (np.inf, -np.inf) for c in means.T]
+    return np.array(limits, dtype=np.float32).T
