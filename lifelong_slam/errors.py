@@ -24,6 +24,10 @@ class TopicError(SourceError):
     """A recording lacks the topic asked for, or the topic has the wrong message type."""
 
 
+class MapError(LifelongSlamError):
+    """A saved map is missing, damaged, in use, of another kind, or doesn't hold what is asked for."""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or an empty string."""
     close = get_close_matches(name, sorted(known), n=1)

@@ -1,0 +1,136 @@
+"""How rows of a map file become a map."""
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import MapError
+from lifelong_slam.geometry import exp
+from lifelong_slam.graph.removal import Removal
+from lifelong_slam.mapping import codec
+from lifelong_slam.mapping.keyframe import Keyframe
+from lifelong_slam.mapping.saved_map import Array, MapInfo, SavedMap, Scans, Session
+from lifelong_slam.result import Edge
+
+_Decoded = TypeVar("_Decoded")
+
+
+def read_map(db: sqlite3.Connection) -> SavedMap:
+    """Read all of a map, inside a transaction.
+
+    Raises:
+        MapError: a blob is damaged; the message names its table and row.
+    """
+    return SavedMap(
+        info=_info(db),
+        sessions=list(_sessions(db)),
+        keyframes={keyframe.id: keyframe for keyframe in _keyframes(db)},
+        poses=_column(db, "vertices", "T_map", unpack_pose),
+        edges=dict(_edges(db)),
+        rejected=frozenset(i for (i,) in db.execute("SELECT id FROM edges WHERE rejected")),
+        removals=list(_removals(db)),
+        scans=list(_scans(db)),
+        submaps=_column(db, "submaps", "voxels", codec.unpack),
+        places=_column(db, "places", "points", codec.unpack_points),
+    )
+
+
+def unpack_pose(blob: bytes) -> Array:
+    """Read a (4, 4) pose; raises ValueError if it is damaged."""
+    return codec.unpack_matrix(blob, 4)
+
+
+def unpack_covariance(blob: bytes) -> Array:
+    """Read a (6, 6) covariance; raises ValueError if it is damaged."""
+    return codec.unpack_matrix(blob, 6)
+
+
+def unpack_scans(blob: bytes) -> tuple[NDArray[np.int64], Array]:
+    """Read (N,) stamps and (N, 4, 4) poses; raises ValueError if they are damaged."""
+    arrays = codec.unpack(blob)
+    return arrays["stamps"].astype(np.int64), exp(arrays["xi"].astype(np.float64))
+
+
+def unpack_support(blob: bytes) -> tuple[NDArray[np.int64], Array, Array]:
+    """Read (k,) neighbours, (k, 4, 4) poses and (k, 6, 6) gains; raises ValueError if damaged."""
+    arrays = codec.unpack(blob)
+    neighbours = arrays["neighbours"].astype(np.int64)
+    poses = arrays["T_neighbour_vertex"].astype(np.float64)
+    gains = arrays["gains"].astype(np.float64)
+    k = len(neighbours)
+    if k == 0 or poses.shape != (k, 4, 4) or gains.shape != (k, 6, 6):
+        raise ValueError("it needs a pose and a gain for each of one or more neighbours")
+    return neighbours, poses, gains
+
+
+def _info(db: sqlite3.Connection) -> MapInfo:
+    T_base_sensor = _column(db, "map", "T_base_sensor", unpack_pose)[1]
+    row = db.execute("SELECT sensor, voxel_size, created, version FROM map").fetchone()
+    sensor, voxel_size, created, version = row
+    return MapInfo(sensor, T_base_sensor, voxel_size, created, version)
+
+
+def _sessions(db: sqlite3.Connection) -> Iterator[Session]:
+    rows = db.execute(
+        "SELECT id, started, source, config, finished, located FROM sessions ORDER BY id"
+    )
+    for id, started, source, config, finished, located in rows:
+        yield Session(id, started, source, config, bool(finished), bool(located))
+
+
+def _keyframes(db: sqlite3.Connection) -> Iterator[Keyframe]:
+    T_odom = _column(db, "vertices", "T_odom", unpack_pose)
+    covariance = _column(db, "vertices", "covariance", unpack_covariance)
+    features = _column(db, "features", "points", codec.unpack_points)
+    unsettled = _column(db, "unsettled", "points", codec.unpack_points)
+    nothing = np.zeros((0, 3), np.float32)
+    rows = db.execute(
+        "SELECT id, session, stamp, travelled FROM vertices JOIN keyframes USING (id) ORDER BY id"
+    )
+    for id, session, stamp, travelled in rows:
+        yield Keyframe(
+            id=id,
+            session=session,
+            stamp=stamp,
+            T_odom_sensor=T_odom[id],
+            covariance=covariance[id],
+            travelled=travelled,
+            features=features.get(id, nothing),
+            points=unsettled.get(id, nothing),
+        )
+
+
+def _edges(db: sqlite3.Connection) -> Iterator[tuple[int, Edge]]:
+    T = _column(db, "edges", "T_source_target", unpack_pose)
+    covariance = _column(db, "edges", "covariance", unpack_covariance)
+    rows = db.execute("SELECT id, source, target, kind FROM edges ORDER BY id")
+    for id, source, target, kind in rows:
+        yield id, Edge(source, target, T[id], covariance[id], kind)
+
+
+def _removals(db: sqlite3.Connection) -> Iterator[Removal]:
+    support = _column(db, "removals", "support", unpack_support)
+    for number, id in db.execute("SELECT number, id FROM removals ORDER BY number"):
+        yield Removal(id, *support[number])
+
+
+def _scans(db: sqlite3.Connection) -> Iterator[Scans]:
+    poses = _column(db, "scans", "poses", unpack_scans)
+    for id, session, anchor in db.execute("SELECT id, session, anchor FROM scans ORDER BY id"):
+        yield Scans(session, anchor, *poses[id])
+
+
+def _column(
+    db: sqlite3.Connection, table: str, column: str, decode: Callable[[bytes], _Decoded]
+) -> dict[int, _Decoded]:
+    """Decode a column of blobs, by rowid and in its order."""
+    decoded = {}
+    for id, blob in db.execute(f"SELECT rowid, {column} FROM {table} ORDER BY rowid"):
+        try:
+            decoded[id] = decode(blob)
+        except ValueError as error:
+            raise MapError(f"{table} {id}, {column}: {error}") from error
+    return decoded
