@@ -1,163 +1,207 @@
 """The whole pipeline.
 
-scan -> odometry -> keyframe -> pose graph <-> loop closures -> trajectory and map
+scan -> odometry -> keyframe -> pose graph <-> loop closures
+                                    |
+                                    v
+                                 pruning -> map, trajectory
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import adjoint, exp, invert, log
+from lifelong_slam.geometry import adjoint, invert
 from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.graph.pruning import Pruning
+from lifelong_slam.graph.removal import Removal, recover
 from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
 from lifelong_slam.mapping.keyframe import Keyframe, KeyframeSelector
 from lifelong_slam.mapping.static_map import StaticMap, thin
+from lifelong_slam.mapping.track import Track
 from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate
 from lifelong_slam.result import Edge, GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
-from lifelong_slam.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+_NO_POINTS = np.zeros((0, 3), np.float32)
+
 
 class LifelongSlam:
-    """Odometry, loop closures and a pose graph over keyframes; poses are of the sensor.
+    """Odometry, loop closures and a pose graph as large as the place; poses are of the sensor.
 
-    Scans between keyframes hang on the graph by their odometry, so that the trajectory has a pose
-    for every scan.
+    The newest keyframes form a window. Those that leave it have seen the loop closures that concern
+    them: they are settled, which puts what they saw into the map and lets the graph do without those that
+    it doesn't need. Every scan keeps a pose for ever: it hangs on its keyframes by odometry, and a
+    removed keyframe hangs on the vertices that were around it.
     """
 
     def __init__(
         self,
         odometry: Odometry,
         loop_closer: LoopCloser,
+        pruning: Pruning,
         static_map: StaticMap,
         keyframe_distance: float = 2.0,
         keyframe_rotation: float = 0.35,
+        window: int = 40,
+        settle_every: int = 10,
     ) -> None:
         """Put the stages together.
 
         Args:
             odometry: front end.
             loop_closer: proposes and verifies loop closures.
-            static_map: makes the map of the keyframes' points.
+            pruning: keeps the graph small.
+            static_map: the map of what keyframes saw.
             keyframe_distance: metres between keyframes.
             keyframe_rotation: radians between keyframes.
+            window: how many of the newest keyframes aren't settled yet; together they should be
+                as long as the map's range, so that a loop is closed before its ends meet in the map.
+            settle_every: keyframes that leave the window at a time, after an optimisation.
         """
         self._odometry = odometry
         self._selector = KeyframeSelector(keyframe_distance, keyframe_rotation)
         self._loop_closer = loop_closer
+        self._pruning = pruning
         self._static_map = static_map
+        self._window_size = window
+        self._settle_every = settle_every
         self._graph = PoseGraph()
-        self._keyframes: list[Keyframe] = []
-        self._stamps: list[int] = []
-        self._odometry_poses: list[Array] = []
-        self._anchors: list[int] = []  # index of the newest keyframe at each scan
-        self._travelled = 0.0
-        self._watched = 0  # keyframes that a viewer has seen
+        self._track = Track()
+        self._keyframes: dict[int, Keyframe] = {}  # those that are vertices
+        self._window: list[int] = []
+        self._removals: list[Removal] = []
+        self._session = 0
+        self._next_id = 0
+        self._watched = -1  # newest keyframe that a viewer has seen
         # Covariance of the newest keyframe since the last closure.
         self._drift: Array = np.zeros((6, 6))
 
     def process(self, scan: Scan) -> StageTimes:
-        """Take in one scan: odometry always, the graph if the scan becomes a keyframe."""
-        start = time.perf_counter()
+        """Take in one scan: odometry always, the graph and the map if it becomes a keyframe."""
+        stages = _Stages()
         estimate = self._odometry.register(scan)
-        self._record(estimate)
-        odometry_end = time.perf_counter()
-        loop_ms = optimise_ms = 0.0
+        self._track.add(estimate.stamp, estimate.T_odom_sensor)
+        stages.end("odometry_ms")
         if self._selector.takes(estimate):
-            loop_ms, optimise_ms = self._add_keyframe(estimate)
-        self._anchors.append(len(self._keyframes) - 1)
+            keyframe = self._add_keyframe(estimate)
+            news = self._close_loops(keyframe, estimate)
+            stages.end("loop_ms")
+            due = len(self._window) >= self._window_size + self._settle_every
+            if news or due:
+                self._graph.optimise()
+            stages.end("optimise_ms")
+            if due:
+                self._settle(self._settle_every)
+            stages.end("prune_ms")
         return StageTimes(
-            odometry_ms=1e3 * (odometry_end - start),
-            loop_ms=loop_ms,
-            optimise_ms=optimise_ms,
-            vertices=len(self._graph),
-            edges=self._graph.edge_count,
+            **stages.milliseconds, vertices=len(self._graph), edges=self._graph.edge_count
         )
 
     def finish(self) -> SlamResult:
-        """Optimise once more, every loop closure with a vote, and put trajectory and map together."""
+        """Put all closures to the vote, settle the window, and return trajectory, map and graph.
+
+        To be called once, after the last scan.
+        """
         self._graph.optimise(reconsider=True)
-        poses = [self._graph.pose(keyframe.id) for keyframe in self._keyframes]
+        self._settle(len(self._window))
+        poses = recover(self._graph.poses(), self._removals)
         return SlamResult(
-            trajectory=Trajectory(np.array(self._stamps, dtype=np.int64), self._every_scan(poses)),
-            map_points=self._static_map.build(self._keyframes, poses),
+            trajectory=self._track.trajectory(np.array([poses[i] for i in self._track.keyframes])),
+            map_points=self._static_map.points(self._graph.poses()),
             graph=self._graph.snapshot(),
             counts={
                 **self._loop_closer.counts,
                 "loop closures outvoted": len(self._graph.rejected),
+                "keyframes": len(self._track.keyframes),
+                "keyframes pruned": len(self._removals),
             },
         )
 
     def watch(self) -> tuple[Array, GraphSnapshot | None]:
         """Return the newest (4, 4) T_map_sensor, and the graph where a keyframe has been added."""
-        keyframe = self._keyframes[-1]
-        motion = invert(keyframe.T_odom_sensor) @ self._odometry_poses[-1]
-        news = len(self._keyframes) > self._watched
-        self._watched = len(self._keyframes)
-        return self._graph.pose(keyframe.id) @ motion, self._graph.snapshot() if news else None
+        newest = self._track.keyframes[-1]
+        news = newest != self._watched
+        self._watched = newest
+        T_map_sensor = self._graph.pose(newest) @ self._track.since_keyframe()
+        return T_map_sensor, self._graph.snapshot() if news else None
 
-    def _record(self, estimate: OdometryEstimate) -> None:
-        if self._odometry_poses:
-            step = estimate.T_odom_sensor[:3, 3] - self._odometry_poses[-1][:3, 3]
-            self._travelled += float(np.linalg.norm(step))
-        self._stamps.append(estimate.stamp)
-        self._odometry_poses.append(estimate.T_odom_sensor)
-
-    def _add_keyframe(self, estimate: OdometryEstimate) -> tuple[float, float]:
-        """Add a vertex with its odometry, look for loops, optimise if one disagrees."""
-        start = time.perf_counter()
+    def _add_keyframe(self, estimate: OdometryEstimate) -> Keyframe:
+        """Make a keyframe of the newest scan, and a vertex with its odometry."""
+        last = self._keyframes[self._window[-1]] if self._window else None
         keyframe = Keyframe(
-            id=len(self._keyframes),
+            id=self._next_id,
+            session=self._session,
             stamp=estimate.stamp,
             T_odom_sensor=estimate.T_odom_sensor,
             covariance=estimate.covariance,
-            travelled=self._travelled,
+            travelled=self._track.travelled,
             features=estimate.cloud.positions.astype(np.float32),
             points=thin(estimate.points, self._static_map.voxel_size),
         )
-        self._extend_graph(keyframe)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(self._drift[3:, 3:])[-1]))
-        closures = self._loop_closer.close(keyframe, estimate.cloud, self._graph.pose, sigma)
-        closed = time.perf_counter()
-        news = False
-        for edge in closures:
-            news |= not self._graph.agrees(edge)
-            self._graph.add_edge(edge)
-            self._drift = edge.covariance
-        if news:
-            self._graph.optimise()
-        return 1e3 * (closed - start), 1e3 * (time.perf_counter() - closed)
-
-    def _extend_graph(self, keyframe: Keyframe) -> None:
-        if not self._keyframes:
+        self._next_id += 1
+        self._keyframes[keyframe.id] = keyframe
+        self._window.append(keyframe.id)
+        self._track.mark_keyframe(keyframe.id)
+        if last is None:
             self._graph.add_vertex(keyframe.id, np.eye(4))
         else:
-            last = self._keyframes[-1]
             motion = invert(last.T_odom_sensor) @ keyframe.T_odom_sensor
             covariance = relative_covariance(last, keyframe, motion)
             self._graph.add_odometry(Edge(last.id, keyframe.id, motion, covariance, "odometry"))
             A = adjoint(invert(motion))
             self._drift = A @ self._drift @ A.T + covariance
-        self._keyframes.append(keyframe)
+        return keyframe
 
-    def _every_scan(self, poses: list[Array]) -> Array:
-        """Carry every scan's odometry along with the keyframes around it.
+    def _close_loops(self, keyframe: Keyframe, estimate: OdometryEstimate) -> bool:
+        """Look for loop closures; tell whether one is news to the graph."""
+        sigma = float(np.sqrt(np.linalg.eigvalsh(self._drift[3:, 3:])[-1]))
+        edges = self._loop_closer.close(
+            keyframe, estimate.cloud, self._keyframes, self._graph, sigma
+        )
+        news = False
+        for edge in edges:
+            news |= self._graph.is_news(edge)
+            if edge.target in self._graph.component(edge.source):
+                self._graph.add_edge(edge)
+            else:
+                self._graph.join(edge)
+            self._drift = edge.covariance
+        return news
 
-        The correction that the graph makes to odometry is known at the keyframes before and after a
-        scan; in between it moves from one to the other in proportion to the time.
-        """
-        before = np.array(self._anchors)
-        after = np.minimum(before + 1, len(self._keyframes) - 1)
-        stamps = np.array([keyframe.stamp for keyframe in self._keyframes])
-        odometry = np.array([keyframe.T_odom_sensor for keyframe in self._keyframes])
-        T = np.array(poses)
-        correction = invert(T[before] @ invert(odometry[before]) @ odometry[after]) @ T[after]
-        span = np.maximum(stamps[after] - stamps[before], 1)
-        fraction = (np.array(self._stamps) - stamps[before]) / span
-        lever = invert(odometry[after]) @ np.array(self._odometry_poses)
-        blend = exp(fraction[:, None] * log(correction))
-        every: Array = T[before] @ invert(odometry[before]) @ odometry[after] @ blend @ lever
-        return every
+    def _settle(self, count: int) -> None:
+        """Let the oldest of the window into the map, and prune the graph; it is at its optimum."""
+        leaving, self._window = self._window[:count], self._window[count:]
+        if not leaving:
+            return
+        around = self._graph.component(leaving[0]) - set(self._window)
+        poses = {vertex: self._graph.pose(vertex) for vertex in sorted(around)}
+        removals = self._pruning.settle(self._graph, leaving)
+        self._removals += removals
+        removed = [removal.vertex for removal in removals]
+        lasting = {vertex: T for vertex, T in poses.items() if vertex in self._graph}
+        for vertex in removed:
+            self._static_map.rehome(vertex, {vertex: poses[vertex], **lasting})
+        for vertex in leaving:
+            self._static_map.settle(self._keyframes[vertex], poses[vertex], lasting)
+            self._keyframes[vertex] = replace(self._keyframes[vertex], points=_NO_POINTS)
+        self._loop_closer.places.rehome(removed, poses, lasting)
+        for vertex in removed:
+            del self._keyframes[vertex]
+
+
+class _Stages:
+    """Stopwatch for the stages of one scan."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.milliseconds: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """Note the time since the last stage ended."""
+        now = time.perf_counter()
+        self.milliseconds[stage] = 1e3 * (now - self._last)
+        self._last = now

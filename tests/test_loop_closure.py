@@ -1,10 +1,13 @@
 """Loop closures: which candidates are tried, what is refused, and what an accepted one says."""
 
 import logging
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from slam_support import (
+    SIGMAS,
     Lidar,
     corridor,
     error_of,
@@ -15,10 +18,11 @@ from slam_support import (
 )
 
 from lifelong_slam.geometry import adjoint, invert, transform
-from lifelong_slam.loop_closure.appearance import PlaceRecogniser
+from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
 from lifelong_slam.loop_closure.verification import Verdict, Verifier
 from lifelong_slam.registration import Cloud
+from lifelong_slam.result import Edge
 
 VOXEL = 0.5
 NOWHERE = np.zeros((0, 3))
@@ -34,31 +38,35 @@ class Drive:
     """Feeds keyframes at given poses to a closer, and keeps what it returns."""
 
     def __init__(self, closer):
-        self.closer, self.poses, self.edges = closer, [], []
+        self.closer, self.edges = closer, []
+        self.graph, self.keyframes = PoseGraph(), {}
         self.travelled = 0.0
 
     def go(self, T_map_sensor, points=NOWHERE, travelled=None, sigma=0.0, belief=None):
         """Arrive at a pose that the graph believes to be `belief`; return the new closures."""
-        if self.poses:
+        T = T_map_sensor if belief is None else belief
+        i = len(self.keyframes)
+        if i:
             self.travelled += float(np.linalg.norm((self.last_true - T_map_sensor)[:3, 3]))
+            motion = invert(self.graph.pose(i - 1)) @ T
+            self.graph.add_odometry(Edge(i - 1, i, motion, np.diag(SIGMAS**2), "odometry"))
+        else:
+            self.graph.add_vertex(0, T)
         self.travelled = self.travelled if travelled is None else travelled
         self.last_true = T_map_sensor
-        self.poses.append(T_map_sensor if belief is None else belief)
-        thinned = Cloud.prepare(points, VOXEL).positions
-        k = keyframe(len(self.poses) - 1, self.poses[-1], thinned, self.travelled)
         cloud = Cloud.prepare(points, VOXEL)
-        edges = self.closer.close(k, cloud, lambda i: self.poses[i], sigma)
+        self.keyframes[i] = keyframe(i, T_map_sensor, cloud.positions, self.travelled)
+        edges = self.closer.close(self.keyframes[i], cloud, self.keyframes, self.graph, sigma)
         self.edges += edges
         return edges
 
     @property
     def tried(self):
-        return sum(self.closer.counts.values())
+        return sum(n for what, n in self.closer.counts.items() if what.startswith("loop by place"))
 
 
 def closer(**settings):
-    # Local maps so long that appearance stays out of what is tested, unless asked for.
-    return LoopCloser(VOXEL, **{"local_map_length": 1e9, "min_travel": 30.0} | settings)
+    return LoopCloser(VOXEL, **{"min_travel": 30.0} | settings)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +129,7 @@ def test_an_accepted_edge_measures_the_true_motion_whatever_the_graph_believes(p
     assert angle < 0.003
     np.testing.assert_allclose(edge.covariance, edge.covariance.T)
     assert np.linalg.eigvalsh(edge.covariance).min() > 0
-    assert drive.closer.counts == {"loop by place: accepted": 1}
+    assert drive.closer.counts == Counter({"loop by place: accepted": 1})
 
 
 def test_an_edge_is_at_least_as_uncertain_as_the_keyframes_at_its_ends(place):
@@ -175,7 +183,7 @@ def test_each_verdict_is_reached_counted_and_logged_with_its_figures(verdict, ca
     drive.go(np.eye(4), reference, travelled=0.0)
     with caplog.at_level(logging.INFO):
         edges = drive.go(np.eye(4), query, travelled=100.0)
-    assert drive.closer.counts == {f"loop by place: {verdict}": 1}
+    assert drive.closer.counts == Counter({f"loop by place: {verdict}": 1})
     assert len(edges) == (verdict is Verdict.ACCEPTED)
     (message,) = [r.getMessage() for r in caplog.records if "loop 1 -> 0" in r.getMessage()]
     assert f"by place: {verdict}" in message
@@ -214,88 +222,117 @@ def test_a_keyframe_is_verified_against_its_candidates_whole_surroundings(place)
     assert together[1].overlap > alone[1].overlap + 0.05
 
 
-RECOGNISER = {"resolution": 0.25, "min_inliers": 10}
-FILLERS = 4  # the package never matches a local map with the three before it
-
-
-def rich_town(seed):
-    return town(seed, 60, lambda xy: np.abs(xy[:, 1]) < 5, spacing=4.0)
-
-
-def pass_through(world, offset, yaw, start=-28.0, first_id=0, travelled=0.0):
-    """Return keyframes of a straight drive through a town, in an odometry frame of its own."""
-    keyframes, poses = [], []
-    for i in range(29):
-        x = (start + 2.0 * i) * np.cos(yaw)
-        T = planar(x, offset, yaw, 1.8)
-        k = keyframe(
-            first_id + i,
-            invert(poses[0]) @ T if poses else np.eye(4),
-            Cloud.prepare(view(world, T, first_id + i), VOXEL).positions,
-            travelled + 2.0 * i,
-        )
-        keyframes.append(k)
-        poses.append(T)
-    return keyframes, poses
-
-
 @pytest.fixture(scope="module")
-def first_visit():
-    """Return the keyframes of a drive through a town and then through others, and their poses."""
-    keyframes, poses = [], []
-    for i in range(1 + FILLERS):
-        more = pass_through(rich_town(5 + i), 0.0, 0.0, first_id=29 * i, travelled=80.0 * i)
-        keyframes += more[0]
-        # In the map, which the recogniser does not know, the towns lie side by side.
-        poses += [planar(0, 300.0 * i) @ T for T in more[1]]
-    return keyframes, poses
+def rich_place():
+    return town(5, 60, lambda xy: np.abs(xy[:, 1]) < 5, spacing=4.0)
 
 
-@pytest.mark.parametrize(("offset", "yaw"), [(0.0, 0.0), (2.0, 0.0), (2.0, np.pi), (-2.0, np.pi)])
-def test_a_place_is_recognised_from_another_lane_and_direction(first_visit, offset, yaw):
-    recogniser = PlaceRecogniser(length=54.0, **RECOGNISER)
-    first, truth = first_visit
-    again, true_again = pass_through(rich_town(5), offset, yaw, first_id=1000, travelled=900.0)
-    assert all(recogniser.add(k) is None for k in first)
-    (found,) = [r for r in map(recogniser.add, again) if r is not None]
-    i, j = found.reference.id, found.query.id - 1000
-    distance, angle = error_of(found.T_reference_query, invert(truth[i]) @ true_again[j])
-    assert distance < 1.5
-    assert angle < 0.1
-    assert found.inliers >= 10
+def pass_through(drive, world, drift=None, offset=0.0, yaw=0.0, begin=None):
+    """Drive 50 m through a town, `begin` metres into the run; return the true poses by keyframe."""
+    truth = {}
+    for x in np.arange(-24.0, 25.0, 2.0):
+        T = planar(x * np.cos(yaw), offset, yaw, 1.8)
+        travelled = None if begin is None else begin + x + 24.0
+        truth[len(drive.keyframes)] = T
+        belief = T if drift is None else drift @ T
+        drive.go(T, view(world, T, len(truth)), travelled, sigma=5.0, belief=belief)
+    return truth
 
 
-def test_another_town_is_not_recognised(first_visit):
-    recogniser = PlaceRecogniser(length=54.0, **RECOGNISER)
-    unknown = pass_through(rich_town(30), 0.0, 0.0, first_id=1000, travelled=900.0)[0]
-    for k in [*first_visit[0], *unknown]:
-        assert recogniser.add(k) is None
+DRIFT = planar(45.0, -60.0, 0.8)
 
 
-def test_local_maps_of_nothing_are_recognised_as_nothing():
-    recogniser = PlaceRecogniser(length=5.0, **RECOGNISER)
-    for i in range(30):
-        assert recogniser.add(keyframe(i, planar(i, 0), NOWHERE)) is None
+def true_motion(edge, truth):
+    return invert(truth[edge.source]) @ truth[edge.target]
 
 
-def test_appearance_closes_a_loop_however_far_the_graph_has_drifted(first_visit):
-    drift = planar(45.0, -60.0, 0.8)
-    closing = LoopCloser(VOXEL, local_map_length=54.0, density_resolution=0.25, min_travel=30.0)
-    first, truth = first_visit
-    count = len(first)
-    again, true_again = pass_through(rich_town(5), 1.0, 0.0, first_id=count, travelled=900.0)
-    poses = [*truth, *(drift @ T for T in true_again)]
-    edges = []
-    for k in [*first, *again]:
-        cloud = Cloud.prepare(k.features.astype(float), VOXEL)
-        edges += closing.close(k, cloud, lambda i: poses[i], 5.0)
-    (edge,) = edges
-    assert closing.counts == {"loop by appearance: accepted": 1}
-    distance, angle = error_of(
-        edge.T_source_target, invert(truth[edge.source]) @ true_again[edge.target - count]
+@pytest.mark.parametrize(("offset", "yaw"), [(1.0, 0.0), (2.0, np.pi)])
+def test_appearance_closes_a_loop_however_far_the_graph_has_drifted(rich_place, offset, yaw):
+    drive = Drive(closer(min_travel=60.0))
+    truth = pass_through(drive, rich_place)
+    assert drive.edges == []
+    truth |= pass_through(drive, rich_place, DRIFT, offset, yaw, begin=400.0)
+    assert drive.edges
+    assert drive.closer.counts == Counter({"loop by appearance": len(drive.edges)})
+    for edge in drive.edges:
+        assert (edge.source < 25, edge.target >= 25, edge.kind) == (True, True, "loop")
+        distance, angle = error_of(edge.T_source_target, true_motion(edge, truth))
+        assert distance < 0.1
+        assert angle < 0.005
+        ends = [drive.keyframes[i] for i in (edge.source, edge.target)]
+        own = relative_covariance(*ends, edge.T_source_target)
+        assert np.linalg.eigvalsh(edge.covariance - own).min() > -1e-12
+
+
+def test_appearance_is_not_asked_while_closures_by_place_confirm_the_graph(rich_place):
+    drive = Drive(closer(min_travel=60.0, spacing=8.0))
+    pass_through(drive, rich_place)
+    pass_through(drive, rich_place, begin=400.0)
+    assert drive.closer.counts["loop by place: accepted"] >= 5
+    assert drive.closer.counts["loop by appearance"] == 0
+
+
+def test_another_town_is_not_taken_for_the_one_that_was_seen(rich_place):
+    drive = Drive(closer(min_travel=60.0))
+    pass_through(drive, rich_place)
+    elsewhere = town(30, 60, lambda xy: np.abs(xy[:, 1]) < 5, spacing=4.0)
+    pass_through(drive, elsewhere, DRIFT, begin=400.0)
+    assert drive.edges == []
+
+
+def test_a_drive_where_nothing_is_seen_is_recognised_nowhere():
+    drive = Drive(closer())
+    for i in range(120):
+        drive.go(planar(2.0 * (i % 30), 0, 0, 1.8), belief=planar(2.0 * i, 0), travelled=2.0 * i)
+    assert drive.edges == []
+    assert drive.tried == 0
+
+
+def test_an_earlier_session_is_old_at_once(place):
+    T = planar(0, 0, 0, 1.8)
+    points = view(place, T)
+    for session, tried in ((0, 0), (1, 1)):
+        drive = Drive(closer(spacing=0.0))
+        drive.go(T, points, travelled=5.0)
+        drive.keyframes[0] = replace(drive.keyframes[0], session=session)
+        drive.go(T, points, travelled=6.0)
+        assert drive.tried == tried
+
+
+def test_another_component_is_out_of_reach_by_place(place):
+    """Its poses are in a frame of their own, so that being near means nothing."""
+    T = planar(0, 0, 0, 1.8)
+    drive = Drive(closer(spacing=0.0))
+    drive.go(T, view(place, T), travelled=0.0)
+    alone = PoseGraph()
+    for i in range(2):
+        alone.add_vertex(i, T)
+    k = keyframe(1, T, view(place, T, 1), 100.0)
+    cloud = Cloud.prepare(k.features.astype(float), VOXEL)
+    keyframes = {**drive.keyframes, 1: k}
+    assert drive.closer.close(k, cloud, keyframes, alone, 0.0) == []
+    assert drive.tried == 0
+
+
+def test_a_closure_leads_to_a_vertex_that_is_still_there(place):
+    """Of a removed keyframe there is neither a candidate nor a part of the submap."""
+    drive = Drive(closer(spacing=0.0))
+    for i, x in enumerate((0.0, 1.0, 2.0)):
+        T = planar(x, 0, 0, 1.8)
+        drive.go(T, view(place, T, i), travelled=float(i))
+    step = planar(2.0, 0)
+    drive.graph.add_edge(Edge(0, 2, step, np.diag(2 * SIGMAS**2), "odometry"))
+    drive.graph.remove_vertex(1)
+    del drive.keyframes[1]
+    here = planar(1.0, 0.1, 0, 1.8)
+    drive.keyframes[3] = keyframe(3, here, view(place, here, 5), 100.0)
+    drive.graph.add_odometry(
+        Edge(2, 3, invert(drive.graph.pose(2)) @ here, np.diag(SIGMAS**2), "odometry")
     )
-    assert distance < 0.1
-    assert angle < 0.005
+    cloud = Cloud.prepare(view(place, here, 5), VOXEL)
+    (edge,) = drive.closer.close(drive.keyframes[3], cloud, drive.keyframes, drive.graph, 0.0)
+    assert edge.source in (0, 2)
+    assert edge.target == 3
 
 
 def test_two_closers_find_the_same_edges_to_the_last_bit(place):

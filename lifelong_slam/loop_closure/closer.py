@@ -2,13 +2,15 @@
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import adjoint, invert
-from lifelong_slam.loop_closure.appearance import PlaceRecogniser
+from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.loop_closure.places import Places
+from lifelong_slam.loop_closure.relocalisation import LocalMap, LocalMapBuilder, Location
 from lifelong_slam.loop_closure.verification import Verdict, Verifier
 from lifelong_slam.mapping.keyframe import Keyframe, submap
 from lifelong_slam.odometry.odometry import OdometryEstimate
@@ -18,15 +20,18 @@ from lifelong_slam.result import Edge
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
-_SUBMAP_REACH = 3  # keyframes before and after the candidate that make up the submap
+_SUBMAP_SIZE = 7  # keyframes around the candidate that make up the submap
+_SUBMAP_RADIUS = 13.0  # metres around the candidate that they come from
+_LOOK_EVERY = 40.0  # metres without a closure after which appearance is asked
 _MAX_TURN = 1.0  # rad; among candidates, those that look the same way are preferred by this scale
 
 
 class LoopCloser:
     """Proposes places that the newest keyframe may have returned to, and verifies them.
 
-    Proposals come from the graph where its uncertainty says which places are in reach, and from
-    appearance for every completed local map, whatever the drift.
+    Proposals come from the graph where its uncertainty says which vertices are in reach, and from
+    appearance wherever no closure has confirmed it for a while. A session that begins in a saved map is
+    located in it by appearance.
     """
 
     def __init__(
@@ -36,9 +41,6 @@ class LoopCloser:
         spacing: float = 8.0,
         min_reach: float = 6.0,
         max_reach: float = 20.0,
-        local_map_length: float = 50.0,
-        density_resolution: float = 0.5,
-        min_inliers: int = 10,
         min_overlap: float = 0.5,
         max_residual: float = 0.06,
         min_degeneracy: float = 0.01,
@@ -51,121 +53,121 @@ class LoopCloser:
             spacing: metres to drive between two attempts by place.
             min_reach: metres around the estimate that are searched however certain it is.
             max_reach: metres beyond which only appearance is trusted to propose.
-            local_map_length: metres of path that a local map for place recognition covers.
-            density_resolution: metres a pixel in place recognition.
-            min_inliers: features that two local maps must share.
             min_overlap: see Verifier, as the next two.
             max_residual: metres.
             min_degeneracy: ratio.
         """
         self._verifier = Verifier(voxel_size, min_overlap, max_residual, min_degeneracy)
-        self._recogniser = PlaceRecogniser(local_map_length, density_resolution, min_inliers)
-        self._voxel_size = voxel_size
+        self._local_maps = LocalMapBuilder(voxel_size)
         self._min_travel = min_travel
         self._spacing = spacing
         self._reach = (min_reach, max_reach)
-        self._keyframes: list[Keyframe] = []
-        self._index: dict[int, int] = {}
         self._last_attempt = 0.0
+        self._confirmed = 0.0  # metres travelled up to the last closure
+        self._last_look = 0.0  # metres travelled when appearance was asked last
+        self.places = Places(voxel_size, min_travel)
         self.counts: Counter[str] = Counter()
 
     def close(
-        self, keyframe: Keyframe, cloud: Cloud, pose: Callable[[int], Array], sigma: float
+        self,
+        query: Keyframe,
+        cloud: Cloud,
+        keyframes: Mapping[int, Keyframe],
+        graph: PoseGraph,
+        sigma: float,
     ) -> list[Edge]:
         """Take in a keyframe and return the verified loop closures that it gives rise to.
 
         Args:
-            keyframe: the newest one.
+            query: the newest keyframe, a vertex of the graph.
             cloud: its points, ready for registration.
-            pose: current (4, 4) T_map_vertex of a vertex; the keyframe's own included.
-            sigma: standard deviation of the keyframe's position since the last closure, metres.
+            keyframes: of all vertices.
+            graph: where they are.
+            sigma: standard deviation of the query's position since the last closure, metres.
         """
-        self._index[keyframe.id] = len(self._keyframes)
-        self._keyframes.append(keyframe)
-        edges = [self._by_place(keyframe, cloud, pose, sigma), self._by_appearance(keyframe, pose)]
-        return [edge for edge in edges if edge is not None]
+        reachable = graph.component(query.id)
+        edges: list[Edge] = []
+        if query.travelled - self._last_attempt >= self._spacing:
+            old = [k for i, k in keyframes.items() if i in reachable and self._is_old(k, query)]
+            edges += self._by_place(query, cloud, old, graph, sigma)
+        local_map = self._local_maps.add(query)
+        if local_map is not None and local_map.reference.id in graph:
+            edges += self._by_appearance(local_map, query, keyframes, graph, reachable)
+        if edges:
+            self._confirmed = query.travelled
+        return edges
 
     def _by_place(
-        self, keyframe: Keyframe, cloud: Cloud, pose: Callable[[int], Array], sigma: float
-    ) -> Edge | None:
-        """Try the best old keyframe within reach of the current estimate."""
-        if keyframe.travelled - self._last_attempt < self._spacing:
-            return None
-        candidate = self._nearest(keyframe, pose, float(np.clip(3 * sigma, *self._reach)))
-        if candidate is None:
-            return None
-        self._last_attempt = keyframe.travelled
-        guess = invert(pose(candidate.id)) @ pose(keyframe.id)
-        return self._verify("place", candidate, keyframe, cloud, guess, pose)
-
-    def _nearest(
-        self, keyframe: Keyframe, pose: Callable[[int], Array], reach: float
-    ) -> Keyframe | None:
-        """Return the old keyframe within reach that is nearest in place and viewing direction."""
-        old = self._old(self._keyframes, keyframe)
-        if not old:
-            return None
-        here = pose(keyframe.id)
-        poses = np.array([pose(k.id) for k in old])
-        distance = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1)
-        turn = np.arccos(np.clip(poses[:, :3, 0] @ here[:3, 0], -1, 1))
-        best = int(np.argmin(distance / reach + turn / _MAX_TURN))
-        return old[best] if distance[best] <= reach else None
-
-    def _by_appearance(self, keyframe: Keyframe, pose: Callable[[int], Array]) -> Edge | None:
-        """Try the place that a completed local map looks like."""
-        recognition = self._recogniser.add(keyframe)
-        if recognition is None:
-            return None
-        query = recognition.query
-        cloud = Cloud.prepare(query.features.astype(np.float64), self._voxel_size)
-        # Of the older local map, the keyframe nearest to where the query seems to be.
-        target = pose(recognition.reference.id) @ recognition.T_reference_query
-        nearby = self._old(self._around(recognition.reference, 4 * _SUBMAP_REACH), query)
-        if not nearby:
-            return None
-        candidate = min(
-            nearby, key=lambda k: float(np.linalg.norm(pose(k.id)[:3, 3] - target[:3, 3]))
-        )
-        return self._verify(
-            "appearance", candidate, query, cloud, invert(pose(candidate.id)) @ target, pose
-        )
-
-    def _around(self, keyframe: Keyframe, reach: int) -> list[Keyframe]:
-        """Return the keyframes that were taken shortly before and after one, itself included."""
-        i = self._index[keyframe.id]
-        return self._keyframes[max(i - reach, 0) : i + reach + 1]
-
-    def _old(self, keyframes: list[Keyframe], query: Keyframe) -> list[Keyframe]:
-        """Return those of the keyframes that were left long enough before the query."""
-        return [k for k in keyframes if query.travelled - k.travelled >= self._min_travel]
-
-    def _verify(
-        self,
-        kind: str,
-        candidate: Keyframe,
-        query: Keyframe,
-        cloud: Cloud,
-        guess: Array,
-        pose: Callable[[int], Array],
-    ) -> Edge | None:
-        """Register the query to the candidate's submap; log and count the outcome."""
-        # Without what is recent: a submap that holds the query itself fits at any guess.
-        around = self._old(self._around(candidate, _SUBMAP_REACH), query)
-        target = submap(around, [pose(k.id) for k in around], pose(candidate.id))
-        verdict, result = self._verifier.verify(target, cloud, [guess])
-        self.counts[f"loop by {kind}: {verdict}"] += 1
+        self, query: Keyframe, cloud: Cloud, old: list[Keyframe], graph: PoseGraph, sigma: float
+    ) -> list[Edge]:
+        """Register the query to the old keyframes around the best one within reach."""
+        here = graph.pose(query.id)
+        reach = float(np.clip(3 * sigma, *self._reach))
+        best = _nearest(old, graph, here, reach, 1)
+        if not best:
+            return []
+        self._last_attempt = query.travelled
+        centre = graph.pose(best[0].id)
+        around = _nearest(old, graph, centre, _SUBMAP_RADIUS, _SUBMAP_SIZE)
+        target = submap(around, [graph.pose(k.id) for k in around], centre)
+        verdict, result = self._verifier.verify(target, cloud, [invert(centre) @ here])
+        self.counts[f"loop by place: {verdict}"] += 1
         logger.info(
-            "loop %d -> %d by %s: %s (overlap %.2f, residual %.3f m, degeneracy %.3f)",
-            query.id, candidate.id, kind, verdict,
+            "loop %d -> %d by place: %s (overlap %.2f, residual %.3f m, degeneracy %.3f)",
+            query.id, best[0].id, verdict,
             result.overlap, result.residual, result.degeneracy,
         )  # fmt: skip
         if verdict is not Verdict.ACCEPTED:
-            return None
-        covariance = result.covariance + relative_covariance(
-            candidate, query, result.T_target_source
-        )
-        return Edge(candidate.id, query.id, result.T_target_source, covariance, "loop")
+            return []
+        T = result.T_target_source
+        covariance = result.covariance + relative_covariance(best[0], query, T)
+        return [Edge(best[0].id, query.id, T, covariance, "loop")]
+
+    def _by_appearance(
+        self,
+        local_map: LocalMap,
+        query: Keyframe,
+        keyframes: Mapping[int, Keyframe],
+        graph: PoseGraph,
+        reachable: Collection[int],
+    ) -> list[Edge]:
+        """Look for a local map among the places, unless closures tell where it is; keep a new one."""
+        locations: list[Location] = []
+        unlocated = len(reachable) < len(graph)
+        unsure = query.travelled - max(self._confirmed, self._last_look) >= _LOOK_EVERY
+        if unlocated or unsure:
+            self._last_look = query.travelled
+            locations = self.places.locate(local_map, graph, reachable)
+            self.counts["loop by appearance"] += len(locations)
+        self.places.add(local_map, graph, reachable)
+        return [self._located(at, keyframes) for at in locations if at.query.id in graph]
+
+    def _located(self, at: Location, keyframes: Mapping[int, Keyframe]) -> Edge:
+        """Return the loop closure that puts a local map's keyframe to where it was recognised."""
+        vertex, T_vertex_place = self.places.anchor(at.reference_id)
+        T = T_vertex_place @ at.registration.T_target_source
+        ends = relative_covariance(keyframes[vertex], at.query, T)
+        return Edge(vertex, at.query.id, T, at.registration.covariance + ends, "loop")
+
+    def _is_old(self, keyframe: Keyframe, query: Keyframe) -> bool:
+        """Tell whether a keyframe was left long enough before the query."""
+        if keyframe.session != query.session:
+            return True
+        return query.travelled - keyframe.travelled >= self._min_travel
+
+
+def _nearest(
+    keyframes: list[Keyframe], graph: PoseGraph, here: Array, reach: float, count: int
+) -> list[Keyframe]:
+    """Return those within reach that are nearest in place and viewing direction, the best first."""
+    if not keyframes:
+        return []
+    T = np.array([graph.pose(keyframe.id) for keyframe in keyframes])
+    distance = np.linalg.norm(T[:, :3, 3] - here[:3, 3], axis=1)
+    turn = np.arccos(np.clip(T[:, :3, 0] @ here[:3, 0], -1, 1))
+    cost = np.where(distance <= reach, distance / reach + turn / _MAX_TURN, np.inf)
+    order = np.argsort(cost, kind="stable")[:count]
+    return [keyframes[i] for i in order if np.isfinite(cost[i])]
 
 
 def relative_covariance(

@@ -1,0 +1,88 @@
+"""The path of a session: every scan by odometry, carried by the keyframes among them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.geometry import exp, invert, log
+from lifelong_slam.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+class Track:
+    """Remembers where every scan was by odometry, so that the graph can say where it was on the map.
+
+    Keyframes may leave the graph; of a scan there is nothing to keep but its stamp and its pose.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._T_odom_sensor: list[Array] = []
+        self._keyframes: list[int] = []
+        self._at: list[int] = []  # index of each keyframe's scan
+        self.travelled = 0.0  # metres
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp: int, T_odom_sensor: Array) -> None:
+        """Take in a scan."""
+        if self._T_odom_sensor:
+            step = T_odom_sensor[:3, 3] - self._T_odom_sensor[-1][:3, 3]
+            self.travelled += float(np.linalg.norm(step))
+        self._stamps.append(stamp)
+        self._T_odom_sensor.append(T_odom_sensor)
+
+    def mark_keyframe(self, keyframe: int) -> None:
+        """Note that the newest scan is a keyframe."""
+        self._keyframes.append(keyframe)
+        self._at.append(len(self._stamps) - 1)
+
+    @property
+    def keyframes(self) -> list[int]:
+        """Ids of all keyframes so far."""
+        return list(self._keyframes)
+
+    def since_keyframe(self) -> Array:
+        """Return (4, 4) T_keyframe_sensor, the motion from the newest keyframe to the newest scan."""
+        return invert(self._T_odom_sensor[self._at[-1]]) @ self._T_odom_sensor[-1]
+
+    def scans_before_newest(self) -> tuple[int, NDArray[np.int64], Array]:
+        """Return the scans from the keyframe before the newest up to that one.
+
+        Returns:
+            The keyframe's id, (N,) stamps, and (N, 4, 4) T_keyframe_scan; the newest itself is left out.
+        """
+        first, end = self._at[-2], self._at[-1]
+        T = invert(self._T_odom_sensor[first]) @ np.array(self._T_odom_sensor[first:end])
+        return self._keyframes[-2], np.array(self._stamps[first:end]), T
+
+    def scans_after_newest(self) -> tuple[int, NDArray[np.int64], Array]:
+        """Return the scans from the newest keyframe on, as above."""
+        first = self._at[-1]
+        T = invert(self._T_odom_sensor[first]) @ np.array(self._T_odom_sensor[first:])
+        return self._keyframes[-1], np.array(self._stamps[first:]), T
+
+    def trajectory(self, T_map_keyframe: Array) -> Trajectory:
+        """Return the pose of every scan on the map.
+
+        The correction that the graph makes to odometry is known at the keyframes before and after a
+        scan; in between it moves from one to the other in proportion to the time.
+
+        Args:
+            T_map_keyframe: (K, 4, 4) of all keyframes in their order.
+        """
+        stamps = np.array(self._stamps, dtype=np.int64)
+        odometry = np.array(self._T_odom_sensor).reshape(-1, 4, 4)
+        at = np.array(self._at)
+        before = np.searchsorted(at, np.arange(len(stamps)), side="right") - 1
+        after = np.minimum(before + 1, len(at) - 1)
+        T, T_odom = T_map_keyframe, odometry[at]
+        correction = invert(T[before] @ invert(T_odom[before]) @ T_odom[after]) @ T[after]
+        span = np.maximum(stamps[at[after]] - stamps[at[before]], 1)
+        fraction = (stamps - stamps[at[before]]) / span
+        blend = exp(fraction[:, None] * log(correction))
+        lever = invert(T_odom[after]) @ odometry
+        return Trajectory(
+            stamps, T[before] @ invert(T_odom[before]) @ T_odom[after] @ blend @ lever
+        )
