@@ -376,6 +376,20 @@ def test_a_pruned_graph_knows_how_wrong_it_is():
         assert abs(np.mean(values) - 1) < band
 
 
+def test_odometry_that_was_handed_over_for_years_is_still_a_number():
+    """Each removal leaves the path of odometry a share of its information; none may underflow."""
+    tight, loose = np.diag(SIGMAS**2), np.diag((100 * SIGMAS) ** 2)
+    graph = PoseGraph()
+    graph.add_vertex(0, np.eye(4))
+    for i in range(1, 400):
+        graph.add_odometry(Edge(i - 1, i, planar(0, 0, 0), loose, "odometry"))
+        if i > 1:
+            graph.add_edge(Edge(0, i, np.eye(4), tight, "loop"))
+            StarMesh().remove(graph, i - 1, {0})
+    assert all(np.isfinite(edge.covariance).all() for edge in graph.edges)
+    assert {edge.kind for edge in graph.edges} == {"odometry", "loop"}
+
+
 def test_edges_of_the_whole_graph_stay_few():
     graph, _ = loop_of(np.random.default_rng(14), 96)
     graph.optimise()

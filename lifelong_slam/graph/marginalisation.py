@@ -26,6 +26,9 @@ from lifelong_slam.result import Edge
 
 Array = NDArray[np.float64]
 
+# Of a pair in the information about the removed vertex. The path of odometry hands its information over
+# to loop closures bit by bit; what is left after years must still be a number, and hold the graph together.
+_LEAST_SHARE = 1e-9
 _LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: keeps it invertible
 
 
@@ -191,7 +194,8 @@ def _mesh(star: _Star) -> list[Edge]:
     i, j = np.array(pairs).T
     products = shares[i] @ shares[j]
     worth, U = np.linalg.eigh((products + np.swapaxes(products, 1, 2)) / 2)
-    worth = np.maximum(worth, _LEAST_EIGENVALUE * np.abs(worth).max(axis=1, keepdims=True))
+    floor = _LEAST_EIGENVALUE * np.abs(worth).max(axis=1, keepdims=True)
+    worth = np.maximum(worth, np.maximum(floor, _LEAST_SHARE))
     root = whiten @ U
     covariances = (root / worth[:, None]) @ np.swapaxes(root, 1, 2)
     # As many as there are neighbours but one: the star's own information, no more and no less, on
