@@ -26,9 +26,7 @@ from lifelong_slam.result import Edge
 
 Array = NDArray[np.float64]
 
-# Of a pair in the information about the removed vertex. The path of odometry hands its information over
-# to loop closures bit by bit; what is left after years must still be a number, and hold the graph together.
-_LEAST_SHARE = 1e-9
+_WEAK = 0.01  # share of an arm in what is known about the vertex
 _LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: keeps it invertible
 
 
@@ -51,12 +49,12 @@ class StarMesh:
     """Edges among neighbours that spend each measurement once and stay few.
 
     The strongest arms become a mesh: all pairs of them, with the information of the Schur complement.
-    Each weaker arm is chained to the strongest one that ends at a lasting vertex: compared with its own
-    uncertainty that one's hardly counts. An edge between two that have one already is fused with it.
+    Each weaker arm is chained to a strong one, whose uncertainty hardly counts beside its own. An edge
+    between two that have one already is fused with it.
 
     An edge that any loop closure went into is a loop closure, which the graph can outvote. Odometry
-    is chained with odometry only, so that the path of odometry through all vertices remains: it keeps the
-    graph connected whatever is outvoted.
+    is also combined with odometry alone, so that the path of odometry through all vertices remains: it
+    keeps the graph connected whatever is outvoted.
 
     A vertex that ends up with too many edges loses the loop closures that are worth least: those between
     vertices that a third one ties together more firmly than they do.
@@ -73,25 +71,15 @@ class StarMesh:
         """Remove a vertex; see Marginalisation."""
         star = _Star(_parallel_fused(graph.incident(vertex), vertex))
         graph.remove_vertex(vertex)
-        strong, weak = self._split(star)
+        strongest = np.argsort(-star.shares, kind="stable")[: self.arms].tolist()
+        strong = [i for i in strongest if star.shares[i] >= _WEAK]
         edges = _mesh(star.subset(strong))
-        if weak:
-            hub = _hub(star, strong, lasting)
-            edges += [star.chained(i, hub) for i in weak]
+        edges += [star.chained(i, j) for i, j in _chains(star, strong, lasting)]
         for edge in edges:
             if edge.source != edge.target:
                 _add_fused(graph, edge)
         for end in {arm.target for arm in star.arms}:
             _drop_least_worth(graph, end, self.max_edges)
-
-    def _split(self, star: "_Star") -> tuple[list[int], list[int]]:
-        """Return the arms to mesh, odometry always among them, and the others."""
-        order = sorted(
-            range(len(star)), key=lambda i: (star.arms[i].kind == "loop", -star.shares[i])
-        )
-        odometry = sum(arm.kind == "odometry" for arm in star.arms)
-        count = max(self.arms, odometry)
-        return order[:count], order[count:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,8 +182,7 @@ def _mesh(star: _Star) -> list[Edge]:
     i, j = np.array(pairs).T
     products = shares[i] @ shares[j]
     worth, U = np.linalg.eigh((products + np.swapaxes(products, 1, 2)) / 2)
-    floor = _LEAST_EIGENVALUE * np.abs(worth).max(axis=1, keepdims=True)
-    worth = np.maximum(worth, np.maximum(floor, _LEAST_SHARE))
+    worth = np.maximum(worth, _LEAST_EIGENVALUE * np.abs(worth).max(axis=1, keepdims=True))
     root = whiten @ U
     covariances = (root / worth[:, None]) @ np.swapaxes(root, 1, 2)
     # As many as there are neighbours but one: the star's own information, no more and no less, on
@@ -206,10 +193,19 @@ def _mesh(star: _Star) -> list[Edge]:
     return [star.edge(*pair, C) for pair, C in zip(pairs, covariances, strict=True)]
 
 
-def _hub(star: _Star, strong: list[int], lasting: Collection[int]) -> int:
-    """Return the arm that weaker ones are chained to."""
+def _chains(star: _Star, strong: list[int], lasting: Collection[int]) -> list[tuple[int, int]]:
+    """Return each weak arm with the one that it is chained to.
+
+    A loop closure goes with the strongest arm that ends at a lasting vertex, odometry with odometry.
+    """
     stay = [i for i in strong if star.arms[i].target in lasting]
-    return max(stay or strong, key=lambda i: float(star.shares[i]))
+    hub = max(stay or strong, key=lambda i: float(star.shares[i]))
+    odometry = [i for i, arm in enumerate(star.arms) if arm.kind == "odometry"]
+    pairs = set()
+    for i in set(range(len(star))) - set(strong):
+        path = [j for j in odometry if j != i] if i in odometry else []
+        pairs |= {(min(i, j), max(i, j)) for j in path or [hub]}
+    return sorted(pairs)
 
 
 def _add_fused(graph: PoseGraph, edge: Edge) -> None:

@@ -11,7 +11,7 @@ held by its root, the vertex that was added without an edge.
 """
 
 import logging
-from collections.abc import Iterable, Set
+from collections.abc import Collection, Iterable, Mapping, Set
 
 import gtsam
 import numpy as np
@@ -68,6 +68,15 @@ class PoseGraph:
         """Edges in use: all odometry, and the loop closures that the last vote let in."""
         return [edge for key, edge in self._edges.items() if key not in self._rejected]
 
+    def keyed_edges(self) -> dict[int, Edge]:
+        """Return all edges by a key that stays theirs, those set aside among them."""
+        return dict(self._edges)
+
+    @property
+    def rejected_keys(self) -> frozenset[int]:
+        """Keys of the loop closures that are set aside."""
+        return frozenset(self._rejected)
+
     @property
     def edge_count(self) -> int:
         """Number of edges in use, factors over many vertices included."""
@@ -89,6 +98,29 @@ class PoseGraph:
     def snapshot(self) -> GraphSnapshot:
         """Return a copy of the graph as it stands."""
         return GraphSnapshot(self.poses(), self.edges)
+
+    def restore(
+        self, poses: Mapping[int, Array], edges: Mapping[int, Edge], rejected: Collection[int]
+    ) -> None:
+        """Fill an empty graph with a saved one; each component hangs on its oldest vertex.
+
+        Args:
+            poses: (4, 4) T_map_vertex.
+            edges: by key, rejected ones among them.
+            rejected: keys of the loop closures that are set aside.
+        """
+        for vertex in sorted(poses):
+            self._insert(vertex, poses[vertex])
+        for key in sorted(edges):
+            self._next_key = key
+            self.add_edge(edges[key], derived=True)
+        self._rejected = set(rejected)
+        self._outvoted = len(self._rejected)
+        placed: set[int] = set()
+        for vertex in self._incident:
+            if vertex not in placed:
+                self._roots.append(vertex)
+                placed |= self.component(vertex)
 
     def incident(self, vertex: int) -> list[Edge]:
         """Return the edges in use that meet in a vertex, in the order in which they were added."""

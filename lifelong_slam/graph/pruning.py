@@ -28,6 +28,10 @@ class Pruning(Protocol):
         """
         ...
 
+    def adopt(self, vertices: Collection[int]) -> None:
+        """Take over vertices that were settled, and stayed, in earlier sessions."""
+        ...
+
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
         """Remove vertices, once and for all, until `keep` are left or only protected ones."""
         ...
@@ -39,6 +43,9 @@ class NoPruning:
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Remove nothing."""
         return []
+
+    def adopt(self, vertices: Collection[int]) -> None:
+        """Do nothing."""
 
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
         """Remove nothing."""
@@ -70,6 +77,10 @@ class Pruner:
         removed = self._selection.settle(poses, set(vertices) - fixed, older - fixed)
         self._kept = (self._kept | set(vertices)) - set(removed)
         return self._remove(graph, removed, self._kept)
+
+    def adopt(self, vertices: Collection[int]) -> None:
+        """Count vertices among those that stayed before. See Pruning."""
+        self._kept |= set(vertices)
 
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
         """Remove down to a number of vertices. See Pruning."""

@@ -163,6 +163,22 @@ class Decimate:
         return [int(i) for i in np.delete(ids, staying)]
 
 
+class Everything:
+    """No vertex stays: for a visitor who only asks where he is."""
+
+    def settle(
+        self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
+    ) -> list[int]:
+        """Remove all new ones; see Selection."""
+        return sorted(new)
+
+    def reduce(
+        self, poses: Mapping[int, Array], removable: Collection[int], count: int
+    ) -> list[int]:
+        """Remove the oldest; see Selection."""
+        return sorted(removable)[:count]
+
+
 class Random:
     """Any vertex goes as likely as any other."""
 
