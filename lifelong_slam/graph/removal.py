@@ -19,7 +19,7 @@ from lifelong_slam.graph.pose_graph import PoseGraph
 
 Array = NDArray[np.float64]
 
-_NEIGHBOURS = 4  # that a removed pose hangs on; more of them gain little
+_NEIGHBOURS = 6  # that a removed pose hangs on; more of them gain little
 
 
 @dataclass(frozen=True, slots=True)
