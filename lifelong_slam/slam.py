@@ -6,18 +6,22 @@ scan -> odometry -> keyframe -> pose graph <-> loop closures
                                  pruning -> map, trajectory
 """
 
+import logging
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import adjoint, invert
+from lifelong_slam.graph.marginalisation import StarMesh
 from lifelong_slam.graph.pose_graph import PoseGraph
-from lifelong_slam.graph.pruning import Pruning
+from lifelong_slam.graph.pruning import Pruner, Pruning
 from lifelong_slam.graph.removal import Removal, recover
+from lifelong_slam.graph.selection import Everything
 from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
 from lifelong_slam.mapping.keyframe import Keyframe, KeyframeSelector
+from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.mapping.static_map import StaticMap, thin
 from lifelong_slam.mapping.track import Track
 from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate
@@ -25,6 +29,7 @@ from lifelong_slam.result import Edge, GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 
 Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
 
 _NO_POINTS = np.zeros((0, 3), np.float32)
 
@@ -74,11 +79,38 @@ class LifelongSlam:
         self._keyframes: dict[int, Keyframe] = {}  # those that are vertices
         self._window: list[int] = []
         self._removals: list[Removal] = []
-        self._session = 0
+        self._session: MapSession | None = None
+        self._map_points: NDArray[np.float32] | None = None  # of a map that stays as it is
+        self._unsaved = _Unsaved()
         self._next_id = 0
         self._watched = -1  # newest keyframe that a viewer has seen
         # Covariance of the newest keyframe since the last closure.
         self._drift: Array = np.zeros((6, 6))
+
+    @property
+    def voxel_size(self) -> float:
+        """Of the map, metres."""
+        return self._static_map.voxel_size
+
+    def begin(self, session: MapSession) -> None:
+        """Go on from the map of a session, and write to it; before the first scan."""
+        self._session = session
+        saved = session.take_saved()
+        if saved is None:
+            return
+        self._next_id = saved.next_keyframe
+        self._keyframes = dict(saved.keyframes)
+        self._graph.restore(saved.poses, saved.edges, saved.rejected)
+        self._static_map.restore(saved.voxels())
+        self._loop_closer.places.restore(saved.places, saved.keyframe_poses(), saved.poses)
+        if session.localize:
+            self._map_points = self._static_map.points(saved.poses)
+            self._pruning = Pruner(Everything(), StarMesh())
+            return
+        unsettled = [i for i, keyframe in saved.keyframes.items() if len(keyframe.points)]
+        self._pruning.adopt(self._keyframes.keys() - set(unsettled))
+        self._window = unsettled  # a session that was cut off
+        self._settle(len(unsettled))
 
     def process(self, scan: Scan) -> StageTimes:
         """Take in one scan: odometry always, the graph and the map if it becomes a keyframe."""
@@ -97,6 +129,7 @@ class LifelongSlam:
             if due:
                 self._settle(self._settle_every)
             stages.end("prune_ms")
+            self._save(self._track.scans_before_newest())
         return StageTimes(
             **stages.milliseconds, vertices=len(self._graph), edges=self._graph.edge_count
         )
@@ -108,16 +141,20 @@ class LifelongSlam:
         """
         self._graph.optimise(reconsider=True)
         self._settle(len(self._window))
+        self._save(self._track.scans_after_newest())
         poses = recover(self._graph.poses(), self._removals)
         return SlamResult(
             trajectory=self._track.trajectory(np.array([poses[i] for i in self._track.keyframes])),
-            map_points=self._static_map.points(self._graph.poses()),
+            map_points=self._static_map.points(self._graph.poses())
+            if self._map_points is None
+            else self._map_points,
             graph=self._graph.snapshot(),
             counts={
                 **self._loop_closer.counts,
                 "loop closures outvoted": len(self._graph.rejected),
                 "keyframes": len(self._track.keyframes),
                 "keyframes pruned": len(self._removals),
+                **self._end_session(),
             },
         )
 
@@ -134,7 +171,7 @@ class LifelongSlam:
         last = self._keyframes[self._window[-1]] if self._window else None
         keyframe = Keyframe(
             id=self._next_id,
-            session=self._session,
+            session=self._session.id if self._session else 0,
             stamp=estimate.stamp,
             T_odom_sensor=estimate.T_odom_sensor,
             covariance=estimate.covariance,
@@ -180,17 +217,57 @@ class LifelongSlam:
         around = self._graph.component(leaving[0]) - set(self._window)
         poses = {vertex: self._graph.pose(vertex) for vertex in sorted(around)}
         removals = self._pruning.settle(self._graph, leaving)
-        self._removals += removals
         removed = [removal.vertex for removal in removals]
         lasting = {vertex: T for vertex, T in poses.items() if vertex in self._graph}
-        for vertex in removed:
-            self._static_map.rehome(vertex, {vertex: poses[vertex], **lasting})
+        if self._map_points is None:
+            for vertex in removed:
+                self._static_map.rehome(vertex, {vertex: poses[vertex], **lasting})
+            for vertex in leaving:
+                self._static_map.settle(self._keyframes[vertex], poses[vertex], lasting)
         for vertex in leaving:
-            self._static_map.settle(self._keyframes[vertex], poses[vertex], lasting)
             self._keyframes[vertex] = replace(self._keyframes[vertex], points=_NO_POINTS)
         self._loop_closer.places.rehome(removed, poses, lasting)
         for vertex in removed:
             del self._keyframes[vertex]
+        self._removals += removals
+        self._unsaved.removals += removals
+        self._unsaved.settled += leaving
+
+    def _save(self, scans: tuple[int, NDArray[np.int64], Array] | None) -> None:
+        """Write what the newest keyframe changed to the map's file."""
+        if self._session is None:
+            return
+        unsaved, self._unsaved = self._unsaved, _Unsaved()
+        changed = self._static_map.take_changed()
+        self._session.write(
+            graph=self._graph,
+            vertices=self._keyframes,
+            scans=[scans] if scans else [],
+            removals=unsaved.removals,
+            settled=unsaved.settled,
+            submaps={i: self._static_map.submaps[i] for i in changed},
+            places=self._loop_closer.places.take_new(),
+        )
+
+    def _end_session(self) -> dict[str, int]:
+        """Mark the session in the map's file as done; return whether it is located in the map."""
+        if self._session is None:
+            return {}
+        self._session.end()
+        if not self._session.is_located:
+            logger.warning(
+                "this session was not located in the map: it stays apart, in a frame of its own"
+                " (drive where the map is for 30 m or more, or start there)"
+            )
+        return {"located in the map": int(self._session.is_located)}
+
+
+@dataclass
+class _Unsaved:
+    """What happened since the map's file was last written."""
+
+    removals: list[Removal] = field(default_factory=list)
+    settled: list[int] = field(default_factory=list)
 
 
 class _Stages:

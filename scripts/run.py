@@ -7,16 +7,17 @@ SIGINT or SIGTERM, with what was mapped until then written (unless it was aborte
 import os
 import shutil
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from console import fail, scan_progress, show_results
@@ -24,10 +25,14 @@ from eval.errors import EvalError
 from eval.run import evaluate_run
 from lifelong_slam.config import build, check_value
 from lifelong_slam.errors import ConfigError, LifelongSlamError
+from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.overrides import check_overrides
 from lifelong_slam.provenance import describe_run, seed_everything
 from lifelong_slam.run_folder import write_run
 from lifelong_slam.runner import RunRecord, ViewerObserver, run, stop_on_signals
+from lifelong_slam.slam import LifelongSlam
+from lifelong_slam.sources.source import Source
+from lifelong_slam.systems.system import System
 from lifelong_slam.viewer import StubViewer
 
 CONF = str(Path(__file__).resolve().parent.parent / "conf")
@@ -65,7 +70,7 @@ def slam(config: DictConfig, folder: Path) -> RunRecord:
         viewer = build(part(config, "viewer"))
         observers = [] if isinstance(viewer, StubViewer) else [ViewerObserver(viewer, system)]
         try:
-            with scan_progress(len(source)) as progress:
+            with map_session(config, system, source), scan_progress(len(source)) as progress:
                 record = run(source, system, [progress, *observers], stop)
         finally:
             viewer.close()
@@ -81,6 +86,30 @@ def part(config: DictConfig, group: str) -> DictConfig:
     if not isinstance(node, DictConfig):
         raise ConfigError(f"nothing is chosen for {group}: give {group}=...")
     return node
+
+
+@contextmanager
+def map_session(config: DictConfig, system: System, source: Source) -> Iterator[None]:
+    """Have the system go on from the map file that is asked for, and keep it open meanwhile."""
+    mode = check_value("mode", config.mode, Literal["map", "localize"])
+    if config.map is None:
+        if mode == "localize":
+            raise ConfigError("mode=localize needs a map to localise in: give map=FILE")
+        yield
+        return
+    if not isinstance(system, LifelongSlam):
+        raise ConfigError(f"map={config.map}: only system=lifelong keeps a map file")
+    with MapSession.open(
+        Path(check_value("map", config.map, str)),
+        mode,
+        sensor=str(config.sensor.name),
+        T_base_sensor=source.T_base_sensor,
+        voxel_size=system.voxel_size,
+        source=str(HydraConfig.get().runtime.choices.scenario),
+        config=OmegaConf.to_yaml(config),
+    ) as session:
+        system.begin(session)
+        yield
 
 
 def run_info(seed: int, record: RunRecord) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from lifelong_slam.io.ply import write_ply
 from lifelong_slam.mapping.occupancy import occupancy_grid
 from lifelong_slam.mapping.saved_map import SavedMap
 from lifelong_slam.mapping.static_map import StaticMap
-from lifelong_slam.mapping.submap import Submap
 from lifelong_slam.run_folder import graph_to_base, points_to_base, trajectory_to_base
 from lifelong_slam.trajectory import write_tum
 
@@ -53,8 +52,7 @@ def static_points(saved: SavedMap) -> NDArray[np.float32]:
     Keyframes that a killed run left unsettled are settled, in memory only.
     """
     static_map = StaticMap(saved.info.voxel_size)
-    submaps = {owner: Submap(**arrays) for owner, arrays in saved.submaps.items()}  # type: ignore[arg-type]
-    static_map.restore(submaps)
+    static_map.restore(saved.voxels())
     poses = {i: saved.poses[i] for i in saved.keyframes}
     for i, keyframe in saved.keyframes.items():
         if len(keyframe.points):

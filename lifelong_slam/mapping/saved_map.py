@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from lifelong_slam.errors import MapError
 from lifelong_slam.graph.removal import Removal, recover
 from lifelong_slam.mapping.keyframe import Keyframe
+from lifelong_slam.mapping.submap import Submap
 from lifelong_slam.result import Edge, GraphSnapshot
 from lifelong_slam.trajectory import Trajectory
 
@@ -133,6 +134,10 @@ class SavedMap:
     scans: list[Scans]
     submaps: dict[int, Arrays]
     places: dict[int, NDArray[np.float32]]
+
+    def voxels(self) -> dict[int, Submap]:
+        """Return the submaps by owner."""
+        return {i: Submap(**arrays) for i, arrays in self.submaps.items()}  # type: ignore[arg-type]
 
     @property
     def next_keyframe(self) -> int:

@@ -47,12 +47,15 @@ class Track:
         """Return (4, 4) T_keyframe_sensor, the motion from the newest keyframe to the newest scan."""
         return invert(self._T_odom_sensor[self._at[-1]]) @ self._T_odom_sensor[-1]
 
-    def scans_before_newest(self) -> tuple[int, NDArray[np.int64], Array]:
+    def scans_before_newest(self) -> tuple[int, NDArray[np.int64], Array] | None:
         """Return the scans from the keyframe before the newest up to that one.
 
         Returns:
-            The keyframe's id, (N,) stamps, and (N, 4, 4) T_keyframe_scan; the newest itself is left out.
+            The keyframe's id, (N,) stamps, and (N, 4, 4) T_keyframe_scan; the newest itself is left
+            out. None if there is only one keyframe.
         """
+        if len(self._at) < 2:
+            return None
         first, end = self._at[-2], self._at[-1]
         T = invert(self._T_odom_sensor[first]) @ np.array(self._T_odom_sensor[first:end])
         return self._keyframes[-2], np.array(self._stamps[first:end]), T

@@ -1,0 +1,175 @@
+"""A run's part in a map file: what it finds there, and what it adds as it goes."""
+
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lifelong_slam.errors import MapError
+from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.graph.removal import Removal
+from lifelong_slam.mapping.keyframe import Keyframe
+from lifelong_slam.mapping.saved_map import MapUpdate, SavedMap, Scans
+from lifelong_slam.mapping.store import MapStore
+from lifelong_slam.mapping.submap import Submap
+from lifelong_slam.result import Edge
+
+Array = NDArray[np.float64]
+Mode = Literal["map", "localize"]
+
+_TOLERANCE = 1e-6  # between calibrations that count as the same
+
+
+class MapSession:
+    """An open map file in which a run is a session, or only looks.
+
+    Attributes:
+        localize: the map is read, and stays as it is.
+        id: of this session.
+    """
+
+    def __init__(self, store: MapStore, saved: SavedMap | None, id: int, localize: bool) -> None:
+        """Wrap an open file; `open` is the way to get one."""
+        self._store = store
+        self._saved = saved
+        self.id = id
+        self.localize = localize
+        # Sessions in a frame of their own; one may be joined to the map by a later one.
+        self._unlocated = {s.id for s in saved.sessions if not s.located} if saved else set()
+        self._unlocated |= {id} - {0}
+        self._roots: list[int] = []
+        self._edges: dict[int, Edge] = dict(saved.edges) if saved else {}
+        self._rejected = saved.rejected if saved else frozenset()
+        self._poses: dict[int, Array] = dict(saved.poses) if saved else {}
+
+    @property
+    def is_located(self) -> bool:
+        """Whether the session is in the map's frame; known after each call of `write`."""
+        return self.id not in self._unlocated
+
+    @classmethod
+    def open(
+        cls,
+        path: Path,
+        mode: Mode,
+        sensor: str,
+        T_base_sensor: Array,
+        voxel_size: float,
+        source: str,
+        config: str,
+    ) -> "MapSession":
+        """Open a map and begin a session, or make a new map.
+
+        Args:
+            path: of the file.
+            mode: "map" to add to it, "localize" to leave it as it is.
+            sensor: name of the sensor's settings.
+            T_base_sensor: (4, 4) pose of the sensor on the base.
+            voxel_size: metres, of the map.
+            source: name of what the scans come from.
+            config: of the run, YAML.
+
+        Raises:
+            MapError: the file is not a map or damaged, was made with another sensor or voxel size, or
+                is to be localised in and isn't there.
+        """
+        localize = mode == "localize"
+        if not path.exists() and not localize:
+            MapStore.create(path, sensor, T_base_sensor, voxel_size).close()
+        store = MapStore.open(path, read_only=localize)
+        try:
+            saved = store.load()
+            _check_fit(path, saved, sensor, T_base_sensor, voxel_size)
+            session = len(saved.sessions) if localize else store.begin_session(source, config)
+        except BaseException:
+            store.close()
+            raise
+        return cls(store, saved if saved.poses else None, session, localize)
+
+    def __enter__(self) -> "MapSession":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._store.close()
+
+    def take_saved(self) -> SavedMap | None:
+        """Return the map as earlier sessions left it, once; None for a new one."""
+        saved = self._saved
+        self._saved = None
+        return saved
+
+    def write(
+        self,
+        graph: PoseGraph,
+        vertices: Mapping[int, Keyframe],
+        scans: Iterable[tuple[int, NDArray[np.int64], Array]],
+        removals: Iterable[Removal],
+        settled: Collection[int],
+        submaps: Mapping[int, Submap],
+        places: Mapping[int, NDArray[np.float32]],
+    ) -> None:
+        """Write what changed since the last call, in one transaction; nothing when localising.
+
+        Args:
+            graph: as it stands.
+            vertices: keyframes that are in it.
+            scans: new ones: keyframe that they hang on, (N,) stamps, (N, 4, 4) T_keyframe_scan.
+            removals: new ones.
+            settled: keyframes whose points are in the submaps from now on.
+            submaps: that changed, by owner.
+            places: new local maps by keyframe.
+        """
+        edges, rejected, poses = graph.keyed_edges(), graph.rejected_keys, graph.poses()
+        roots = graph.roots
+        located = self._unlocated & _located(graph, vertices) if roots != self._roots else set()
+        if not self.localize:
+            update = MapUpdate(
+                keyframes=[vertices[i] for i in sorted(poses.keys() - self._poses.keys())],
+                poses={i: T for i, T in poses.items() if not _same(self._poses.get(i), T)},
+                removed=list(removals),
+                edges={key: e for key, e in edges.items() if self._edges.get(key) is not e},
+                removed_edges=self._edges.keys() - edges.keys(),
+                rejected=rejected if rejected != self._rejected else None,
+                scans=[Scans(self.id, *rows) for rows in scans],
+                settled=[vertex for vertex in settled if vertex in graph],
+                submaps={i: submap.arrays() for i, submap in submaps.items()},
+                places=places,
+                located=located,
+            )
+            self._store.write(update)
+        self._edges, self._rejected, self._poses = edges, rejected, poses
+        self._roots = roots
+        self._unlocated -= located
+
+    def end(self) -> None:
+        """Mark the session as finished."""
+        if not self.localize:
+            self._store.end_session(self.id)
+
+
+def _located(graph: PoseGraph, vertices: Mapping[int, Keyframe]) -> set[int]:
+    """Return the sessions in the component of the map's first vertex."""
+    connected = graph.component(graph.roots[0])
+    return {keyframe.session for i, keyframe in vertices.items() if i in connected}
+
+
+def _same(before: Array | None, now: Array) -> bool:
+    return before is not None and bool(np.array_equal(before, now))
+
+
+def _check_fit(
+    path: Path, saved: SavedMap, sensor: str, T_base_sensor: Array, voxel_size: float
+) -> None:
+    """Refuse a map that was made with other settings."""
+    info = saved.info
+    if info.sensor != sensor:
+        raise MapError(f"{path} was made with sensor={info.sensor}, not {sensor}")
+    if not np.allclose(info.T_base_sensor, T_base_sensor, atol=_TOLERANCE):
+        raise MapError(
+            f"{path} was made with the sensor elsewhere on the base:\n{info.T_base_sensor}\n"
+            f"and not\n{T_base_sensor}"
+        )
+    if info.voxel_size != voxel_size:
+        raise MapError(f"{path} has voxels of {info.voxel_size} m, not {voxel_size} m")
