@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lifelong_slam.errors import ConfigError
 from lifelong_slam.geometry import adjoint, invert
 from lifelong_slam.graph.marginalisation import StarMesh
 from lifelong_slam.graph.pose_graph import PoseGraph
@@ -93,7 +94,13 @@ class LifelongSlam:
         return self._static_map.voxel_size
 
     def begin(self, session: MapSession) -> None:
-        """Go on from the map of a session, and write to it; before the first scan."""
+        """Go on from the map of a session, and write to it; before the first scan.
+
+        Raises:
+            ConfigError: the pruning can't be combined with a map file.
+        """
+        if not self._pruning.leaves_edges:
+            raise ConfigError("what this pruning leaves has no place in a map file: choose another")
         self._session = session
         saved = session.take_saved()
         if saved is None:
@@ -143,12 +150,13 @@ class LifelongSlam:
         self._settle(len(self._window))
         self._save(self._track.scans_after_newest())
         poses = recover(self._graph.poses(), self._removals)
+        graph = self._snapshot()
         return SlamResult(
             trajectory=self._track.trajectory(np.array([poses[i] for i in self._track.keyframes])),
-            map_points=self._static_map.points(self._graph.poses())
+            map_points=self._static_map.points(graph.poses)
             if self._map_points is None
             else self._map_points,
-            graph=self._graph.snapshot(),
+            graph=graph,
             counts={
                 **self._loop_closer.counts,
                 "loop closures outvoted": len(self._graph.rejected),
@@ -164,14 +172,27 @@ class LifelongSlam:
         news = newest != self._watched
         self._watched = newest
         T_map_sensor = self._graph.pose(newest) @ self._track.since_keyframe()
-        return T_map_sensor, self._graph.snapshot() if news else None
+        return T_map_sensor, self._snapshot() if news else None
+
+    @property
+    def _session_id(self) -> int:
+        return self._session.id if self._session else 0
+
+    def _snapshot(self) -> GraphSnapshot:
+        """Return the graph without sessions that are in frames of their own."""
+        own = [i for i in self._graph.vertices if self._keyframes[i].session == self._session_id]
+        connected = self._graph.component(own[-1] if own else self._graph.roots[0])
+        return GraphSnapshot(
+            {i: T for i, T in self._graph.poses().items() if i in connected},
+            [edge for edge in self._graph.edges if edge.source in connected],
+        )
 
     def _add_keyframe(self, estimate: OdometryEstimate) -> Keyframe:
         """Make a keyframe of the newest scan, and a vertex with its odometry."""
         last = self._keyframes[self._window[-1]] if self._window else None
         keyframe = Keyframe(
             id=self._next_id,
-            session=self._session.id if self._session else 0,
+            session=self._session_id,
             stamp=estimate.stamp,
             T_odom_sensor=estimate.T_odom_sensor,
             covariance=estimate.covariance,

@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import gtsam
 import numpy as np
@@ -33,7 +33,13 @@ _LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: k
 
 
 class Marginalisation(Protocol):
-    """Removes vertices from a graph and keeps what was measured through them."""
+    """Removes vertices from a graph and keeps what was measured through them.
+
+    Attributes:
+        leaves_edges: what it leaves are edges between two vertices.
+    """
+
+    leaves_edges: ClassVar[bool]
 
     def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
         """Remove a vertex.
@@ -66,6 +72,7 @@ class StarMesh:
         max_edges: at a vertex.
     """
 
+    leaves_edges: ClassVar[bool] = True
     arms: int = 6
     max_edges: int = 24
 
@@ -95,6 +102,8 @@ class ChowLiu:
     remains odometry, all others count as loop closures.
     """
 
+    leaves_edges: ClassVar[bool] = True
+
     def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
         """Remove a vertex; see Marginalisation."""
         star = _Star.around(graph, vertex)
@@ -115,6 +124,8 @@ class ChowLiu:
 @dataclass(frozen=True, slots=True)
 class Dense:
     """The Schur complement as it is: one factor over all neighbours, linearised for good."""
+
+    leaves_edges: ClassVar[bool] = False
 
     def remove(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> None:
         """Remove a vertex; see Marginalisation."""

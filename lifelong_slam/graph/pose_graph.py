@@ -237,17 +237,24 @@ class PoseGraph:
         return seen
 
     def join(self, edge: Edge) -> None:
-        """Add the loop closure that locates the target's component in the source's.
+        """Add the loop closure that locates one component in the other.
 
-        The target's component is moved as a whole to where the closure puts it.
+        The one with the younger root is moved, as a whole, to where the closure puts it.
         """
-        shift = self.pose(edge.source) @ edge.T_source_target @ invert(self.pose(edge.target))
         moved = self.component(edge.target)
+        shift = self.pose(edge.source) @ edge.T_source_target @ invert(self.pose(edge.target))
+        other = self.component(edge.source)
+        if self._age(moved) < self._age(other):
+            moved, shift = other, invert(shift)
         for vertex in moved:
             self._values.update(vertex, gtsam.Pose3(shift @ self.pose(vertex)))
         self._roots = [root for root in self._roots if root not in moved]
         self._joined = True
         self.add_edge(edge)
+
+    def _age(self, component: Set[int]) -> int:
+        """Return the rank of a component's root among the roots, the oldest first."""
+        return next(i for i, root in enumerate(self._roots) if root in component)
 
     def is_news(self, edge: Edge) -> bool:
         """Tell whether a measurement misses the current estimate by so much that it can't wait."""

@@ -17,7 +17,13 @@ from lifelong_slam.graph.selection import Selection
 
 
 class Pruning(Protocol):
-    """Keeps a growing graph small."""
+    """Keeps a growing graph small.
+
+    Attributes:
+        leaves_edges: what it leaves are edges between two vertices, which files can hold.
+    """
+
+    leaves_edges: bool
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Remove what the graph can do without among vertices that left the window of the newest.
@@ -39,6 +45,8 @@ class Pruning(Protocol):
 
 class NoPruning:
     """Leaves the graph as it is."""
+
+    leaves_edges = True
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Remove nothing."""
@@ -65,6 +73,7 @@ class Pruner:
         self._selection = selection
         self._marginalisation = marginalisation
         self._kept: set[int] = set()
+        self.leaves_edges = marginalisation.leaves_edges
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Choose among the given vertices and those that stayed before. See Pruning."""

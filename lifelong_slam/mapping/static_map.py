@@ -109,11 +109,12 @@ class StaticMap:
         """Return (M, 3) float32 static points in the map frame, one for each voxel of that frame.
 
         Args:
-            poses: (4, 4) T_map_vertex of all owners.
+            poses: (4, 4) T_map_vertex; owners that aren't among them are left out.
         """
         clouds: list[Array] = [np.zeros((0, 3))]
         weights: list[NDArray[np.uint8]] = [np.zeros(0, np.uint8)]
-        for owner, submap in self._submaps.items():
+        for owner in sorted(self._submaps.keys() & poses.keys()):
+            submap = self._submaps[owner]
             means = submap.means[submap.static].astype(np.float64)
             clouds.append(transform(poses[owner], means))
             weights.append(submap.weights[submap.static])
