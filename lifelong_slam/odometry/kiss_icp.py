@@ -8,10 +8,12 @@ What is ours is how they are driven:
   period; KISS-ICP would spread the whole period's motion over it);
 - the first two scans are registered twice, for the motion and then deskewed by it;
 - motions that the model did not predict are checked (`motion_check`);
+- the local map forgets what was seen long ago, and not only what is far away (`recent_map`);
 - each answer is refined against surfaces, which yields its covariance (`surface_refinement`).
 """
 
 import logging
+from functools import partial
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -22,11 +24,13 @@ from kiss_icp.config.config import (
     RegistrationConfig,
 )
 from kiss_icp.kiss_icp import KissICP
+from kiss_icp.mapping import get_voxel_hash_map
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import exp, invert, log, transform
 from lifelong_slam.odometry.motion_check import MotionCheck
 from lifelong_slam.odometry.odometry import OdometryEstimate
+from lifelong_slam.odometry.recent_map import RecentMap
 from lifelong_slam.odometry.surface_refinement import SurfaceRefinement
 from lifelong_slam.registration import Cloud
 from lifelong_slam.scan import NANOSECONDS, Scan
@@ -93,6 +97,8 @@ class KissIcpOdometry:
             adaptive_threshold=AdaptiveThresholdConfig(),
         )
         self._kiss = KissICP(config)
+        self._new_map = partial(get_voxel_hash_map, config)
+        self._map = RecentMap(self._new_map)
         self._voxel_size = voxel_size
         self._check = MotionCheck(voxel_size)
         self._refinement = SurfaceRefinement(voxel_size)
@@ -153,7 +159,7 @@ class KissIcpOdometry:
         return np.asarray(
             self._kiss.registration.align_points_to_map(
                 points=source,
-                voxel_map=self._kiss.local_map,
+                voxel_map=self._map.current,
                 initial_guess=guess,
                 max_correspondance_distance=3 * sigma,
                 kernel=sigma,
@@ -166,7 +172,7 @@ class KissIcpOdometry:
         cloud = Cloud.prepare(downsampled, self._voxel_size)
         T, covariance = self._refinement.refine(cloud, guess)
         self._refinement.insert(cloud, T)
-        self._kiss.local_map.update(downsampled, T)
+        self._map.update(downsampled, T)
         self._check.remember(downsampled, T)
         covariance = covariance + self._distortion.covariance
         return OdometryEstimate(scan.middle_stamp, T, covariance, points, cloud)
@@ -180,7 +186,7 @@ class KissIcpOdometry:
             motion = self._check.first_motion(self._deskew(first), self._deskew(second))
             self._velocity = log(motion) / interval
         logger.info("starting at %.1f m/s", np.linalg.norm(self._velocity[3:]))
-        self._kiss.local_map.clear()
+        self._map = RecentMap(self._new_map)
         self._check = MotionCheck(self._voxel_size)
         self._refinement = SurfaceRefinement(self._voxel_size)
         return self._enter(first, self._deskew(first), np.eye(4))
