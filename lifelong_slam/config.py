@@ -4,7 +4,7 @@ import importlib
 import inspect
 from collections.abc import Mapping, Sequence
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -109,6 +109,8 @@ def check_value(where: str, value: Any, annotation: Any) -> Any:
 
 def _is_plain(annotation: Any) -> bool:
     """Tell whether a type is made of numbers, strings and containers of them."""
+    if get_origin(annotation) is Literal:
+        return True
     arguments = [a for a in get_args(annotation) if a is not Ellipsis]
     if not arguments:
         return annotation in (*_CHECKED_TYPES, type(None))

@@ -109,7 +109,7 @@ class LifelongSlam:
         self._keyframes = dict(saved.keyframes)
         self._graph.restore(saved.poses, saved.edges, saved.rejected)
         self._static_map.restore(saved.voxels())
-        self._loop_closer.places.restore(saved.places, saved.keyframe_poses(), saved.poses)
+        self._loop_closer.places.restore(saved.places, saved.keyframe_poses(), saved.hosts())
         if session.localize:
             self._map_points = self._static_map.points(saved.poses)
             self._pruning = Pruner(Everything(), StarMesh())
@@ -117,7 +117,9 @@ class LifelongSlam:
         unsettled = [i for i, keyframe in saved.keyframes.items() if len(keyframe.points)]
         self._pruning.adopt(self._keyframes.keys() - set(unsettled))
         self._window = unsettled  # a session that was cut off
+        self._graph.optimise()
         self._settle(len(unsettled))
+        self._static_map.forget_views()
 
     def process(self, scan: Scan) -> StageTimes:
         """Take in one scan: odometry always, the graph and the map if it becomes a keyframe."""

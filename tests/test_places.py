@@ -162,12 +162,13 @@ def test_a_place_is_hung_on_the_nearest_vertex():
     assert places.anchor(2)[0] == 3
 
 
-def test_saved_places_hang_on_the_nearest_vertices():
+def test_saved_places_hang_on_the_vertices_that_carry_their_keyframes():
     """Some of the keyframes that they were seen from are no vertices any more."""
     vertices = {7: planar(0, 0, 1.0), 9: planar(50, 0), 12: planar(50, 40, -2.0)}
     seen_from = {3: planar(2, 1, 0.5, 1.0), 9: planar(50, 0), 11: planar(45, 33)}
     places = Places(VOXEL, 30.0)
-    places.restore(dict.fromkeys(seen_from, NOTHING), seen_from, vertices)
+    hosts = {3: 7, 9: 9, 11: 12}
+    places.restore(dict.fromkeys(seen_from, NOTHING), vertices | seen_from, hosts)
     assert [places.anchor(i)[0] for i in seen_from] == [7, 9, 12]
     for i, T in seen_from.items():
         vertex, T_vertex_place = places.anchor(i)
@@ -189,7 +190,7 @@ def test_places_of_earlier_sessions_are_asked_for_at_once():
     graph = chain_of([planar(20.0 * i, 0) for i in range(3)])
     poses = graph.poses()
     places = scripted([])
-    places.restore({0: NOTHING}, poses, poses)
+    places.restore({0: NOTHING}, poses, {0: 0})
     places.add(local_map(1, 500.0, session=1), graph, graph.component(0))
     places.locate(local_map(2, 0.0, session=2), graph, graph.component(0))
     assert places._relocaliser.asked == [{0, 1}]

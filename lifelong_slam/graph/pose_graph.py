@@ -37,7 +37,7 @@ class PoseGraph:
     def __init__(self) -> None:
         self._values = gtsam.Values()
         self._roots: list[int] = []
-        self._joined = False  # a root was given up for a loop closure
+        self._parted = False  # loop closures hold components together, which may fall apart
         self._incident: dict[int, set[int]] = {}  # keys of factors by vertex
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
         self._edges: dict[int, Edge] = {}  # keys as above; factors over many vertices aren't edges
@@ -116,6 +116,7 @@ class PoseGraph:
             self.add_edge(edges[key], derived=True)
         self._rejected = set(rejected)
         self._outvoted = len(self._rejected)
+        self._parted = True
         placed: set[int] = set()
         for vertex in self._incident:
             if vertex not in placed:
@@ -225,7 +226,7 @@ class PoseGraph:
 
     def component(self, vertex: int) -> Set[int]:
         """Return all vertices that edges in use connect with a vertex, itself included."""
-        if len(self._roots) == 1 and not self._joined:
+        if len(self._roots) == 1 and not self._parted:
             return self._incident.keys()
         seen, front = {vertex}, [vertex]
         while front:
@@ -249,12 +250,13 @@ class PoseGraph:
         for vertex in moved:
             self._values.update(vertex, gtsam.Pose3(shift @ self.pose(vertex)))
         self._roots = [root for root in self._roots if root not in moved]
-        self._joined = True
+        self._parted = True
         self.add_edge(edge)
 
     def _age(self, component: Set[int]) -> int:
         """Return the rank of a component's root among the roots, the oldest first."""
-        return next(i for i, root in enumerate(self._roots) if root in component)
+        ranks = (i for i, root in enumerate(self._roots) if root in component)
+        return next(ranks, len(self._roots))
 
     def is_news(self, edge: Edge) -> bool:
         """Tell whether a measurement misses the current estimate by so much that it can't wait."""
@@ -381,14 +383,15 @@ class PoseGraph:
         return graph
 
     def _gauges(self) -> list[int]:
-        """Return the roots, and a vertex of each part that closures set aside have cut off."""
-        gauges = list(self._roots)
-        if self._joined:
-            placed = set().union(*(self.component(root) for root in gauges))
-            for vertex in self._incident:
-                if vertex not in placed:
-                    gauges.append(vertex)
-                    placed |= self.component(vertex)
+        """Return the oldest root, or vertex where closures set aside have cut it off, of each part."""
+        if len(self._roots) == 1 and not self._parted:
+            return self._roots
+        gauges: list[int] = []
+        placed: set[int] = set()
+        for vertex in (*self._roots, *self._incident):
+            if vertex not in placed:
+                gauges.append(vertex)
+                placed |= self.component(vertex)
         return gauges
 
 

@@ -52,17 +52,19 @@ class Places:
         self,
         places: Mapping[int, NDArray[np.float32]],
         poses: Mapping[int, Array],
-        vertices: Mapping[int, Array],
+        hosts: Mapping[int, int],
     ) -> None:
         """Take in the places of earlier sessions.
 
         Args:
             places: (N, 3) local maps by the keyframe whose frame they are in.
-            poses: (4, 4) T_map_keyframe of these keyframes, in the graph or not.
-            vertices: (4, 4) T_map_vertex of the graph's vertices.
+            poses: (4, 4) T_map_keyframe of these keyframes and of their hosts.
+            hosts: the vertex that each of them hangs on, or is.
         """
         for place, points in places.items():
-            self._anchors[place] = _hung(poses[place], vertices, _EARLIER, 0.0)
+            host = hosts[place]
+            T_host_place = invert(poses[host]) @ poses[place]
+            self._anchors[place] = _Anchor(host, T_host_place, _EARLIER, 0.0)
             self._relocaliser.add_place(place, points)
 
     def anchor(self, place: int) -> tuple[int, Array]:
@@ -108,7 +110,9 @@ class Places:
         inside = [at for at in locations if self._anchors[at.reference_id].vertex in reachable]
         if inside:
             return inside[:1]
-        return self._locator.agreeing(locations, lambda place: self._pose(place, graph))
+        return self._locator.agreeing(
+            self._in_oldest_component(locations, graph), lambda place: self._pose(place, graph)
+        )
 
     def add(self, local_map: LocalMap, graph: PoseGraph, reachable: Collection[int]) -> None:
         """Keep a local map if its component has no place there that looks the same way."""
@@ -123,6 +127,15 @@ class Places:
         self._anchors[here.id] = _Anchor(here.id, np.eye(4), here.session, here.travelled)
         self._relocaliser.add_place(here.id, local_map.points)
         self._new[here.id] = local_map.points
+
+    def _in_oldest_component(self, locations: list[Location], graph: PoseGraph) -> list[Location]:
+        """Return those in one frame: sessions that were never located may show the same place."""
+        for root in graph.roots:
+            connected = graph.component(root)
+            inside = [at for at in locations if self._anchors[at.reference_id].vertex in connected]
+            if inside:
+                return inside
+        return []
 
     def _pose(self, place: int, graph: PoseGraph) -> Array:
         anchor = self._anchors[place]

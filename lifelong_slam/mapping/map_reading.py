@@ -25,7 +25,7 @@ def read_map(db: sqlite3.Connection) -> SavedMap:
         MapError: a blob is damaged; the message names its table and row.
     """
     return SavedMap(
-        info=_info(db),
+        info=read_info(db),
         sessions=list(_sessions(db)),
         keyframes={keyframe.id: keyframe for keyframe in _keyframes(db)},
         poses=_column(db, "vertices", "T_map", unpack_pose),
@@ -66,7 +66,8 @@ def unpack_support(blob: bytes) -> tuple[NDArray[np.int64], Array, Array]:
     return neighbours, poses, gains
 
 
-def _info(db: sqlite3.Connection) -> MapInfo:
+def read_info(db: sqlite3.Connection) -> MapInfo:
+    """Read what holds for a map as a whole; raises MapError if it is damaged."""
     T_base_sensor = _column(db, "map", "T_base_sensor", unpack_pose)[1]
     row = db.execute("SELECT sensor, voxel_size, created, version FROM map").fetchone()
     sensor, voxel_size, created, version = row

@@ -180,6 +180,13 @@ class SavedMap:
         except LookupError as error:
             raise MapError(str(error)) from error
 
+    def hosts(self) -> dict[int, int]:
+        """Return the vertex that each keyframe ever taken is, or hangs on most of all in the end."""
+        hosts = {vertex: vertex for vertex in self.poses}
+        for removal in reversed(self.removals):
+            hosts[removal.vertex] = hosts[int(removal.neighbours[0])]
+        return hosts
+
     def trajectory(self) -> Trajectory:
         """Return T_map_sensor at every scan in the order of time.
 

@@ -11,7 +11,7 @@ from lifelong_slam.errors import MapError
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.removal import Removal
 from lifelong_slam.mapping.keyframe import Keyframe
-from lifelong_slam.mapping.saved_map import MapUpdate, SavedMap, Scans
+from lifelong_slam.mapping.saved_map import MapInfo, MapUpdate, SavedMap, Scans
 from lifelong_slam.mapping.store import MapStore
 from lifelong_slam.mapping.submap import Submap
 from lifelong_slam.result import Edge
@@ -38,7 +38,9 @@ class MapSession:
         self.localize = localize
         # Sessions in a frame of their own; one may be joined to the map by a later one.
         self._unlocated = {s.id for s in saved.sessions if not s.located} if saved else set()
-        self._unlocated |= {id} - {0}
+        if id > 0 or localize:
+            self._unlocated.add(id)
+        self._is_nowhere = localize and saved is None
         self._roots: list[int] = []
         self._edges: dict[int, Edge] = dict(saved.edges) if saved else {}
         self._rejected = saved.rejected if saved else frozenset()
@@ -78,10 +80,11 @@ class MapSession:
         localize = mode == "localize"
         if not path.exists() and not localize:
             MapStore.create(path, sensor, T_base_sensor, voxel_size).close()
+        with MapStore.open(path, read_only=True) as look:  # a map that doesn't fit stays untouched
+            _check_fit(path, look.info(), sensor, T_base_sensor, voxel_size)
         store = MapStore.open(path, read_only=localize)
         try:
             saved = store.load()
-            _check_fit(path, saved, sensor, T_base_sensor, voxel_size)
             session = len(saved.sessions) if localize else store.begin_session(source, config)
         except BaseException:
             store.close()
@@ -123,7 +126,9 @@ class MapSession:
         """
         edges, rejected, poses = graph.keyed_edges(), graph.rejected_keys, graph.poses()
         roots = graph.roots
-        located = self._unlocated & _located(graph, vertices) if roots != self._roots else set()
+        located: set[int] = set()
+        if roots != self._roots and not self._is_nowhere:
+            located = self._unlocated & _located(graph, vertices)
         if not self.localize:
             update = MapUpdate(
                 keyframes=[vertices[i] for i in sorted(poses.keys() - self._poses.keys())],
@@ -160,10 +165,9 @@ def _same(before: Array | None, now: Array) -> bool:
 
 
 def _check_fit(
-    path: Path, saved: SavedMap, sensor: str, T_base_sensor: Array, voxel_size: float
+    path: Path, info: MapInfo, sensor: str, T_base_sensor: Array, voxel_size: float
 ) -> None:
     """Refuse a map that was made with other settings."""
-    info = saved.info
     if info.sensor != sensor:
         raise MapError(f"{path} was made with sensor={info.sensor}, not {sensor}")
     if not np.allclose(info.T_base_sensor, T_base_sensor, atol=_TOLERANCE):

@@ -62,6 +62,10 @@ class StaticMap:
         """Go on from a saved map, with an odometry that starts anew."""
         self._submaps = dict(submaps)
         self._changed.clear()
+        self.forget_views()
+
+    def forget_views(self) -> None:
+        """Get ready for keyframes whose odometry starts anew."""
         self._views.clear()
 
     def take_changed(self) -> set[int]:

@@ -13,9 +13,9 @@ from pathlib import Path
 from lifelong_slam import __version__
 from lifelong_slam.errors import MapError
 from lifelong_slam.mapping import codec, map_file
-from lifelong_slam.mapping.map_reading import read_map
+from lifelong_slam.mapping.map_reading import read_info, read_map
 from lifelong_slam.mapping.map_writing import write_update
-from lifelong_slam.mapping.saved_map import Array, MapUpdate, SavedMap
+from lifelong_slam.mapping.saved_map import Array, MapInfo, MapUpdate, SavedMap
 
 
 class MapStore:
@@ -100,6 +100,15 @@ class MapStore:
         """
         with self._transaction() as db:
             write_update(db, update)
+
+    def info(self) -> MapInfo:
+        """Read what holds for the map as a whole.
+
+        Raises:
+            MapError: it is damaged.
+        """
+        with map_file.errors_of(self._path), self._connection as db:
+            return read_info(db)
 
     def load(self) -> SavedMap:
         """Read all of the map, as of one moment.
