@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 _SUBMAP_SIZE = 7  # keyframes around the candidate that make up the submap
 _SUBMAP_RADIUS = 13.0  # metres around the candidate that they come from
+_OVERLAP = 100.0  # metres of path; nearer local maps show the same by odometry already
 _LOOK_EVERY = 40.0  # metres without a closure after which appearance is asked
 _MAX_TURN = 1.0  # rad; among candidates, those that look the same way are preferred by this scale
 
@@ -65,7 +66,7 @@ class LoopCloser:
         self._last_attempt = 0.0
         self._confirmed = 0.0  # metres travelled up to the last closure
         self._last_look = 0.0  # metres travelled when appearance was asked last
-        self.places = Places(voxel_size, min_travel)
+        self.places = Places(voxel_size, max(min_travel, _OVERLAP))
         self.counts: Counter[str] = Counter()
 
     def close(
