@@ -484,9 +484,13 @@ def test_a_map_whose_first_session_has_no_keyframe_begins_with_the_second(tmp_pa
 @pytest.mark.parametrize(
     ("system", "settings", "message"),
     [
-        (KissIcpSystem(1.0, 40.0, 0.5), {"map": "a.map", "mode": "map"}, "only system=lifelong"),
         (
-            KissIcpSystem(1.0, 40.0, 0.5),
+            KissIcpSystem(1.0, 40.0, 0.5, threads=1),
+            {"map": "a.map", "mode": "map"},
+            "only system=lifelong",
+        ),
+        (
+            KissIcpSystem(1.0, 40.0, 0.5, threads=1),
             {"map": "a.map", "mode": "localize"},
             "only system=lifelong",
         ),
