@@ -258,9 +258,9 @@ class LifelongSlam:
 
     def _save(self, scans: tuple[int, NDArray[np.int64], Array] | None) -> None:
         """Write what the newest keyframe changed to the map's file."""
+        unsaved, self._unsaved = self._unsaved, _Unsaved()
         if self._session is None:
             return
-        unsaved, self._unsaved = self._unsaved, _Unsaved()
         changed = self._static_map.take_changed()
         self._session.write(
             graph=self._graph,

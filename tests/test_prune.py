@@ -50,6 +50,22 @@ def write_laps(folder, **settings):
     return folder / "in.g2o", folder / "truth.g2o"
 
 
+def test_a_part_that_only_closures_set_aside_lead_to_is_held_where_it_is():
+    """Two drives that nothing but a closure ties together; without it each must have its own gauge."""
+    step = np.eye(4)
+    step[0, 3] = 1.0
+    covariance = 1e-4 * np.eye(6)
+    poses = {i: np.eye(4) for i in (0, 1, 10, 11)}
+    edges = [Edge(i, i + 1, step, covariance, "odometry") for i in (0, 10)]
+    graph = LoadedGraph(GraphSnapshot(poses, [*edges, Edge(1, 10, step, covariance, "loop")]))
+    assert graph.component(0) == {0, 1, 10, 11}
+    graph._rejected = set(graph._loops)
+    assert graph.component(0) == {0, 1}
+    graph._solve(set())
+    np.testing.assert_allclose(graph.pose(1), step, atol=1e-6)
+    np.testing.assert_allclose(graph.pose(11), step, atol=1e-6)
+
+
 @pytest.mark.parametrize("planar", [True, False])
 def test_reduces_a_file_and_tells_what_that_changed(cli, tmp_path, planar):
     graph, truth = write_laps(tmp_path, planar=planar)

@@ -11,15 +11,14 @@ import gtsam
 import networkx
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from lifelong_slam.geometry import invert, log
+from lifelong_slam.graph.pose_graph import INLIER_THRESHOLD
 from lifelong_slam.result import Edge, GraphSnapshot
 
 Array = NDArray[np.float64]
 
 _LOOP_WEIGHT = 1e9  # more than there are odometry edges: closures come in only where odometry ends
-_OUTLIER = float(chi2.ppf(0.999, 6))  # what a loop closure that is wrong costs at most
 
 
 def connected(graph: GraphSnapshot) -> list[set[int]]:
@@ -102,4 +101,4 @@ def _misfit(edges: list[Edge], poses: Mapping[int, Array]) -> float:
     whitened = np.linalg.solve(covariances, errors[..., None])[..., 0]
     distances = np.einsum("ij,ij->i", errors, whitened)
     loop = np.array([edge.kind == "loop" for edge in edges])
-    return float(np.where(loop, np.minimum(distances, _OUTLIER), distances).sum())
+    return float(np.where(loop, np.minimum(distances, INLIER_THRESHOLD), distances).sum())

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from lifelong_slam.geometry import adjoint, invert
-from lifelong_slam.graph.edges import fuse, kind_of, outward
+from lifelong_slam.graph.edges import chain, fuse, kind_of, outward, reverse
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.result import Edge
 
@@ -167,7 +167,7 @@ class _Star:
 
     def chained(self, i: int, j: int) -> Edge:
         """Return the edge from one neighbour through the vertex to another, both arms in full."""
-        return self.edge(i, j, self.covariances[i] + self.covariances[j])
+        return chain(reverse(self.arms[i]), self.arms[j])
 
     def edge(self, i: int, j: int, covariance: Array, shift: Array | None = None) -> Edge:
         """Return an edge between two neighbours.

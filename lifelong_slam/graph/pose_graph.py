@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
 INLIER_PROBABILITY = 0.999  # share of true closures whose error lies below the threshold
-_THRESHOLD = float(chi2.ppf(INLIER_PROBABILITY, 6))
+INLIER_THRESHOLD = float(chi2.ppf(INLIER_PROBABILITY, 6))
 _SEVERAL = 3  # loop closures set aside since the last vote that call for another
 _NEWS = 0.2  # metres; less doesn't mislead the search for loop closures
 _GAUGE_SIGMA = 1e-6  # m and rad; the root defines the frame
@@ -100,28 +100,29 @@ class PoseGraph:
         return GraphSnapshot(self.poses(), self.edges)
 
     def restore(
-        self, poses: Mapping[int, Array], edges: Mapping[int, Edge], rejected: Collection[int]
+        self,
+        poses: Mapping[int, Array],
+        edges: Mapping[int, Edge],
+        rejected: Collection[int] = (),
+        solved: bool = True,
     ) -> None:
-        """Fill an empty graph with a saved one; each component hangs on its oldest vertex.
+        """Fill an empty graph with a whole one; each component hangs on its lowest vertex.
 
         Args:
             poses: (4, 4) T_map_vertex.
             edges: by key, rejected ones among them.
             rejected: keys of the loop closures that are set aside.
+            solved: the poses are the optimum of the others; else closures have yet to be accepted.
         """
         for vertex in sorted(poses):
             self._insert(vertex, poses[vertex])
         for key in sorted(edges):
             self._next_key = key
-            self.add_edge(edges[key], derived=True)
+            self.add_edge(edges[key], derived=solved)
         self._rejected = set(rejected)
         self._outvoted = len(self._rejected)
         self._parted = True
-        placed: set[int] = set()
-        for vertex in self._incident:
-            if vertex not in placed:
-                self._roots.append(vertex)
-                placed |= self.component(vertex)
+        self._roots = self._gauges()
 
     def incident(self, vertex: int) -> list[Edge]:
         """Return the edges in use that meet in a vertex, in the order in which they were added."""
@@ -301,7 +302,7 @@ class PoseGraph:
         rise = -self._cost(established)
         self._solve(used)
         rise += self._cost(used)
-        return self._undisputed(used) and rise <= _THRESHOLD * max(len(new), 1)
+        return self._undisputed(used) and rise <= INLIER_THRESHOLD * max(len(new), 1)
 
     def _insert(self, vertex: int, T_map_vertex: Array) -> None:
         self._values.insert(vertex, gtsam.Pose3(T_map_vertex))
@@ -325,7 +326,7 @@ class PoseGraph:
 
     def _undisputed(self, loops: set[int]) -> bool:
         """Tell whether all of the given loop closures are as near to the estimate as true ones."""
-        return all(2 * self._factors[key].error(self._values) <= _THRESHOLD for key in loops)
+        return all(2 * self._factors[key].error(self._values) <= INLIER_THRESHOLD for key in loops)
 
     def _vote(self, before: gtsam.Values, established: set[int]) -> None:
         """Decide which loop closures are in, those from before or those that non-convexity picks.
@@ -337,7 +338,7 @@ class PoseGraph:
         for loops, start in ((self._graduated(before), self._values), (established, before)):
             self._values = start
             self._solve(loops)
-            objective = self._cost(loops) + _THRESHOLD * len(self._loops - loops)
+            objective = self._cost(loops) + INLIER_THRESHOLD * len(self._loops - loops)
             candidates.append((objective, loops, self._values))
         _, loops, self._values = min(candidates, key=lambda candidate: candidate[0])
         self._rejected = self._loops - loops

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
-from lifelong_slam.graph.initialisation import best_start, connected
+from lifelong_slam.graph.initialisation import best_start
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.pruning import Pruning
 from lifelong_slam.graph.removal import Removal, recover
@@ -110,14 +110,7 @@ class LoadedGraph(PoseGraph):
         """
         super().__init__()
         self._robust = robust
-        for vertex, T_map_vertex in snapshot.poses.items():
-            self._insert(vertex, T_map_vertex)
-        for edge in snapshot.edges:
-            self.add_edge(edge)
-        odometry = [edge for edge in snapshot.edges if edge.kind == "odometry"]
-        parts = connected(snapshot)
-        self._roots = [min(part) for part in parts]
-        self._joined = len(connected(GraphSnapshot(snapshot.poses, odometry))) > len(parts)
+        self.restore(snapshot.poses, dict(enumerate(snapshot.edges)), solved=False)
 
     def optimise(self, reconsider: bool = False) -> None:
         """Find the poses that fit the edges best; see PoseGraph."""

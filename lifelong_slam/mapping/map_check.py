@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from lifelong_slam.errors import MapError
+from lifelong_slam.graph.initialisation import connected
 from lifelong_slam.graph.removal import Removal
 from lifelong_slam.mapping import codec, map_file
 from lifelong_slam.mapping.map_reading import (
@@ -180,9 +179,5 @@ def _sessions(saved: SavedMap) -> Iterator[str]:
 
 def _parts(saved: SavedMap) -> dict[int, int]:
     """Return the number of the connected part of the graph that each vertex is in."""
-    row = {vertex: i for i, vertex in enumerate(saved.poses)}
-    edges = saved.graph().edges
-    ends = ([row[edge.source] for edge in edges], [row[edge.target] for edge in edges])
-    graph = coo_array((np.ones(len(edges)), ends), shape=(len(row), len(row)))
-    _, parts = connected_components(graph, directed=False)
-    return dict(zip(row, parts.tolist(), strict=True))
+    parts = connected(saved.graph())
+    return {vertex: number for number, part in enumerate(parts) for vertex in part}

@@ -1,5 +1,7 @@
 """The path of a session: every scan by odometry, carried by the keyframes among them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,9 +41,9 @@ class Track:
         self._at.append(len(self._stamps) - 1)
 
     @property
-    def keyframes(self) -> list[int]:
+    def keyframes(self) -> Sequence[int]:
         """Ids of all keyframes so far."""
-        return list(self._keyframes)
+        return self._keyframes
 
     def since_keyframe(self) -> Array:
         """Return (4, 4) T_keyframe_sensor, the motion from the newest keyframe to the newest scan."""
