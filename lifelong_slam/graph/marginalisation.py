@@ -237,12 +237,8 @@ def _equal_forces(star: _Star, i: Indices, j: Indices, information: Array) -> Ar
     r = star.residuals
     total = star.information.sum(0)
     r = r - np.linalg.solve(total, np.einsum("nij,nj->i", star.information, r))
-    laplacian = np.zeros((count, 6, count, 6))
-    for a, b, W in zip(i, j, information, strict=True):
-        laplacian[a, :, a] += W
-        laplacian[b, :, b] += W
-        laplacian[a, :, b] -= W
-        laplacian[b, :, a] -= W
+    ends = np.eye(count)[i] - np.eye(count)[j]  # (K, n) +1 where an edge begins, -1 where it ends
+    laplacian = np.tensordot(ends[:, :, None] * ends[:, None], information, (0, 0)).swapaxes(1, 2)
     forces = np.einsum("nij,nj->ni", star.information, r)
     u = np.zeros((count, 6))
     size = 6 * (count - 1)

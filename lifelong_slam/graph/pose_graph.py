@@ -299,10 +299,9 @@ class PoseGraph:
         # What the new closures cost all edges together: a lone one that is wrong bends a long chain
         # of odometry without any single edge, itself included, standing out.
         used = established | new
-        rise = -self._cost(established)
-        self._solve(used)
-        rise += self._cost(used)
-        return self._undisputed(used) and rise <= INLIER_THRESHOLD * max(len(new), 1)
+        before = self._cost(established) if new else np.inf  # nothing to weigh without new ones
+        rise = self._solve(used) - before
+        return self._undisputed(used) and rise <= INLIER_THRESHOLD * len(new)
 
     def _insert(self, vertex: int, T_map_vertex: Array) -> None:
         self._values.insert(vertex, gtsam.Pose3(T_map_vertex))
@@ -337,8 +336,7 @@ class PoseGraph:
         candidates = []
         for loops, start in ((self._graduated(before), self._values), (established, before)):
             self._values = start
-            self._solve(loops)
-            objective = self._cost(loops) + INLIER_THRESHOLD * len(self._loops - loops)
+            objective = self._solve(loops) + INLIER_THRESHOLD * len(self._loops - loops)
             candidates.append((objective, loops, self._values))
         _, loops, self._values = min(candidates, key=lambda candidate: candidate[0])
         self._rejected = self._loops - loops
@@ -349,11 +347,13 @@ class PoseGraph:
         """Return the sum of squared Mahalanobis distances with the given loop closures."""
         return 2 * float(self._nonlinear_graph(loops).error(self._values))
 
-    def _solve(self, loops: set[int]) -> None:
-        """Run Levenberg-Marquardt with the given loop closures."""
+    def _solve(self, loops: set[int]) -> float:
+        """Run Levenberg-Marquardt with the given loop closures; return what they cost then."""
         graph = self._nonlinear_graph(loops)
-        self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm()).optimize()
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm())
+        self._values = optimiser.optimize()
         self._new -= loops
+        return 2 * float(optimiser.error())
 
     def _graduated(self, before: gtsam.Values) -> set[int]:
         """Return the loop closures that graduated non-convexity lets in; poses follow."""

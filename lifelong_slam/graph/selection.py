@@ -66,11 +66,11 @@ class Geometry:
 
         One that was kept goes only if the optimiser moved it within half the spacing of another.
         """
-        ids = np.array(list(poses))
-        limit = np.where(np.isin(ids, list(older)), self._spacing / 2, 0.0)
-        limit[np.isin(ids, list(new))] = self._spacing
+        ids = list(poses)
+        limits = dict.fromkeys(older, self._spacing / 2) | dict.fromkeys(new, self._spacing)
+        limit = np.array([limits.get(vertex, 0.0) for vertex in ids])
         density = _Density(self._places(poses), _REACH * self._spacing)
-        return [int(ids[i]) for i in density.thin(limit)]
+        return [ids[i] for i in density.thin(limit)]
 
     def reduce(
         self, poses: Mapping[int, Array], removable: Collection[int], count: int
