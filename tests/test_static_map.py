@@ -157,6 +157,15 @@ def settled(keyframes, poses, owners, static_map=None):
     return static_map
 
 
+def built_from(keyframes, poses, static_map=None):
+    """Return the points of a map whose owners are 5 m apart."""
+    owners = {}
+    for i, pose in enumerate(poses):
+        if all(np.linalg.norm(T[:3, 3] - pose[:3, 3]) >= 5.0 for T in owners.values()):
+            owners[i] = pose
+    return settled(keyframes, poses, owners, static_map or StaticMap(0.2)).points(owners)
+
+
 def test_a_maps_points_are_the_means_of_what_was_measured_in_each_voxel(monkeypatch):
     without_looks(monkeypatch)
     keyframes, poses = clutter(2)
@@ -199,15 +208,17 @@ def test_points_belong_to_the_nearest_owner_and_move_with_it():
 
 def test_points_beyond_the_range_stay_out_of_the_map():
     points = np.array([[5.0, 0, 0], [79.0, 0, 0], [81.0, 0, 0]])
-    built = StaticMap(VOXEL, max_range=80.0).build([keyframe(0, np.eye(4), points)], [np.eye(4)])
+    built = built_from(
+        [keyframe(0, np.eye(4), points)], [np.eye(4)], StaticMap(VOXEL, max_range=80.0)
+    )
     assert sorted(built[:, 0].tolist()) == [5.0, 79.0]
 
 
 def test_a_map_of_nothing_is_empty():
-    assert StaticMap().build([], []).shape == (0, 3)
+    assert built_from([], []).shape == (0, 3)
     blind = keyframe(0, np.eye(4), np.zeros((0, 3)))
     for keyframes in ([blind], [blind] * 3):
-        built = StaticMap().build(keyframes, [np.eye(4)] * len(keyframes))
+        built = built_from(keyframes, [np.eye(4)] * len(keyframes))
         assert built.shape == (0, 3)
         assert built.dtype == np.float32
 
@@ -341,8 +352,8 @@ def in_lane(points):
 
 def test_what_moves_leaves_no_trail(oncoming_car, empty_street):
     assert len(in_lane(measured(*oncoming_car))) > 300
-    assert len(in_lane(StaticMap(0.2).build(*oncoming_car))) == 0
-    assert len(in_lane(StaticMap(0.2).build(*empty_street))) == 0
+    assert len(in_lane(built_from(*oncoming_car))) == 0
+    assert len(in_lane(built_from(*empty_street))) == 0
 
 
 def test_what_stands_remains(empty_street, parked_car):
@@ -362,8 +373,8 @@ def test_what_stands_remains(empty_street, parked_car):
 def test_what_moves_is_removed_wherever_the_map_frame_lies(oncoming_car):
     keyframes, poses = oncoming_car
     X = exp(np.array([0.0, 0.0, 2.0, 500.0, -300.0, 20.0]))
-    here = StaticMap(0.2).build(keyframes, poses)
-    there = StaticMap(0.2).build(keyframes, [X @ T for T in poses])
+    here = built_from(keyframes, poses)
+    there = built_from(keyframes, [X @ T for T in poses])
     back = transform(invert(X), there.astype(float))
     assert len(in_lane(back)) == 0
     # Owners' voxels that lie askew in the map's fill fewer of these.
@@ -371,7 +382,7 @@ def test_what_moves_is_removed_wherever_the_map_frame_lies(oncoming_car):
 
 
 def test_the_same_keyframes_give_the_same_map(oncoming_car):
-    maps = [StaticMap(0.2).build(*oncoming_car) for _ in range(2)]
+    maps = [built_from(*oncoming_car) for _ in range(2)]
     np.testing.assert_array_equal(maps[0], maps[1])
 
 

@@ -124,29 +124,30 @@ class MapSession:
             submaps: that changed, by owner.
             places: new local maps by keyframe.
         """
-        edges, rejected, poses = graph.keyed_edges(), graph.rejected_keys, graph.poses()
         roots = graph.roots
         located: set[int] = set()
         if roots != self._roots and not self._is_nowhere:
             located = self._unlocated & _located(graph, vertices)
-        if not self.localize:
-            update = MapUpdate(
-                keyframes=[vertices[i] for i in sorted(poses.keys() - self._poses.keys())],
-                poses={i: T for i, T in poses.items() if not _same(self._poses.get(i), T)},
-                removed=list(removals),
-                edges={key: e for key, e in edges.items() if self._edges.get(key) is not e},
-                removed_edges=self._edges.keys() - edges.keys(),
-                rejected=rejected if rejected != self._rejected else None,
-                scans=[Scans(self.id, *rows) for rows in scans],
-                settled=[vertex for vertex in settled if vertex in graph],
-                submaps={i: submap.arrays() for i, submap in submaps.items()},
-                places=places,
-                located=located,
-            )
-            self._store.write(update)
-        self._edges, self._rejected, self._poses = edges, rejected, poses
         self._roots = roots
         self._unlocated -= located
+        if self.localize:
+            return
+        edges, rejected, poses = graph.keyed_edges(), graph.rejected_keys, graph.poses()
+        update = MapUpdate(
+            keyframes=[vertices[i] for i in sorted(poses.keys() - self._poses.keys())],
+            poses={i: T for i, T in poses.items() if not _same(self._poses.get(i), T)},
+            removed=list(removals),
+            edges={key: e for key, e in edges.items() if self._edges.get(key) is not e},
+            removed_edges=self._edges.keys() - edges.keys(),
+            rejected=rejected if rejected != self._rejected else None,
+            scans=[Scans(self.id, *rows) for rows in scans],
+            settled=[vertex for vertex in settled if vertex in graph],
+            submaps={i: submap.arrays() for i, submap in submaps.items()},
+            places=places,
+            located=located,
+        )
+        self._store.write(update)
+        self._edges, self._rejected, self._poses = edges, rejected, poses
 
     def end(self) -> None:
         """Mark the session as finished."""

@@ -7,7 +7,7 @@ both decides (see `Submap`).
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +26,6 @@ Points = NDArray[np.float32]
 _STRIDE = 2  # every second keyframe looks; a moving thing is passed by more than one
 _LOOKS_BACK = 15  # views that new voxels are held against
 _BLOCK = 2.0  # metres; what goes to one owner
-_OWNER_DISTANCE = 5.0  # metres, for a map that is built in one go
 
 
 def thin(points: Array, voxel_size: float) -> Points:
@@ -126,19 +125,6 @@ class StaticMap:
         one_owner = np.zeros(len(points), np.intp)
         voxels = _Voxels.group(one_owner, points, np.concatenate(weights), self.voxel_size)
         return voxels.means.astype(np.float32)
-
-    def build(self, keyframes: Sequence[Keyframe], poses: Sequence[Array]) -> Points:
-        """Return (M, 3) float32 static points in the map frame, from all keyframes in one go.
-
-        Args:
-            keyframes: all of them, in the order of time.
-            poses: (4, 4) T_map_keyframe of each.
-        """
-        whole = StaticMap(self.voxel_size, self.max_range)
-        owners = _spread(poses)
-        for keyframe, pose in zip(keyframes, poses, strict=True):
-            whole.settle(keyframe, pose, owners)
-        return whole.points(owners)
 
     def _submap(self, owner: int) -> Submap:
         """Return an owner's submap to be changed."""
@@ -273,13 +259,3 @@ class _Voxels:
         ends = np.flatnonzero(np.diff(self.owners, append=-1)) + 1
         for start, end in zip(starts, ends, strict=True):
             yield int(self.owners[start]), slice(start, end)
-
-
-def _spread(poses: Sequence[Array]) -> dict[int, Array]:
-    """Choose poses that are no closer to each other than owners need to be."""
-    chosen: dict[int, Array] = {}
-    for i, pose in enumerate(poses):
-        places = np.array([T[:3, 3] for T in chosen.values()]).reshape(-1, 3)
-        if np.all(np.linalg.norm(places - pose[:3, 3], axis=1) >= _OWNER_DISTANCE):
-            chosen[i] = pose
-    return chosen
