@@ -6,10 +6,8 @@ there is nothing to write and the first signal aborts.
 """
 
 import logging
-import os
 import signal
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,10 +15,10 @@ from types import FrameType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.resources import ResourceMonitor, release_free_memory
 from lifelong_slam.result import GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
@@ -29,13 +27,17 @@ from lifelong_slam.systems.system import System
 from lifelong_slam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
-_MEGABYTE = 1e6
-_SAMPLING_PERIOD = 0.1
+
+_RELEASE_EVERY = 100  # scans; it takes some 20 ms
 
 
 @dataclass(frozen=True, slots=True)
 class TimelineRow:
-    """Where the time of one scan went, and what the run held after it (a row of timeline.csv)."""
+    """Where the time of one scan went, and what the run held after it (a row of timeline.csv).
+
+    Memory of the process itself is as after the scan; that of its children, and CPU (100 is one
+    core), as sampled last, see `lifelong_slam.resources`.
+    """
 
     stamp: int
     odometry_ms: float
@@ -45,6 +47,8 @@ class TimelineRow:
     vertices: int
     edges: int
     rss_mb: float
+    child_rss_mb: float
+    cpu_percent: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +60,10 @@ class RunRecord:
         timeline: one row a scan.
         counts: what was seen, repaired and left out of the input.
         wall_seconds: from asking for the first scan to the system's result, reading included.
-        peak_rss_mb: largest resident memory of the process during the run, sampled at 10 Hz.
+        peak_rss_mb: largest resident memory of the process and its children during the run.
         interrupted: the run was asked to stop before the last scan.
-        cpu_percent: processor time over wall time; 100 is one core in full use.
+        cpu_percent: processor time over wall time, children included; 100 is one core in full use.
+        mean_rss_mb: mean over time of the resident memory of the process and its children.
         info: versions, seed, machine and settings that make the run repeatable.
     """
 
@@ -69,6 +74,7 @@ class RunRecord:
     peak_rss_mb: float
     interrupted: bool
     cpu_percent: float = 0.0
+    mean_rss_mb: float = 0.0
     info: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -149,41 +155,6 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.signal(number, handler)
 
 
-class ResourceMonitor:
-    """Samples the process's memory in a thread of its own, and takes its processor time."""
-
-    def __init__(self) -> None:
-        self._process = psutil.Process(os.getpid())
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._sample, daemon=True)
-        self._start = (0.0, 0.0)
-        self.peak_rss_mb = 0.0
-        self.wall_seconds = 0.0
-        self.cpu_percent = 0.0
-
-    def __enter__(self) -> "ResourceMonitor":
-        self._start = (time.perf_counter(), time.process_time())
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.wall_seconds = time.perf_counter() - self._start[0]
-        self.cpu_percent = 100.0 * (time.process_time() - self._start[1]) / self.wall_seconds
-        self._done.set()
-        self._thread.join()
-        self.rss_mb()
-
-    def rss_mb(self) -> float:
-        """Return the resident memory now, and remember the largest value seen."""
-        rss = float(self._process.memory_info().rss) / _MEGABYTE
-        self.peak_rss_mb = max(self.peak_rss_mb, rss)
-        return rss
-
-    def _sample(self) -> None:
-        while not self._done.wait(_SAMPLING_PERIOD):
-            self.rss_mb()
-
-
 def run(
     source: Source,
     system: System,
@@ -218,6 +189,7 @@ def run(
         peak_rss_mb=monitor.peak_rss_mb,
         interrupted=interrupted,
         cpu_percent=monitor.cpu_percent,
+        mean_rss_mb=monitor.mean_rss_mb,
         info=info or {},
     )
 
@@ -233,7 +205,9 @@ def _feed(
     for scan in scans:
         stop.running = True
         times = system.process(scan)
-        timeline.append(_row(scan, times, monitor.rss_mb()))
+        timeline.append(_row(scan, times, monitor))
+        if len(timeline) % _RELEASE_EVERY == 0:
+            release_free_memory()
         for observer in observers:
             observer.update(scan, times)
         if stop.requested:
@@ -241,7 +215,7 @@ def _feed(
     return timeline
 
 
-def _row(scan: Scan, times: StageTimes, rss_mb: float) -> TimelineRow:
+def _row(scan: Scan, times: StageTimes, monitor: ResourceMonitor) -> TimelineRow:
     return TimelineRow(
         stamp=scan.end_stamp,
         odometry_ms=times.odometry_ms,
@@ -250,7 +224,9 @@ def _row(scan: Scan, times: StageTimes, rss_mb: float) -> TimelineRow:
         prune_ms=times.prune_ms,
         vertices=times.vertices,
         edges=times.edges,
-        rss_mb=rss_mb,
+        rss_mb=monitor.rss_mb(),
+        child_rss_mb=monitor.latest.child_rss_mb,
+        cpu_percent=monitor.latest.cpu_percent,
     )
 
 
