@@ -58,7 +58,8 @@ from throughput import compose_config, facts, markdown, portable
 
 from eval.alignment import kabsch
 from eval.errors import EvalError
-from eval.files import atomic_path, read_points, write_json
+from eval.files import atomic_path, write_json
+from eval.map_files import read_map
 from lifelong_slam.config import build
 from lifelong_slam.errors import ConfigError, LifelongSlamError, SourceError
 from lifelong_slam.geometry import transform
@@ -116,7 +117,7 @@ def _measure_sessions(options: argparse.Namespace) -> tuple[list[MapScore], list
         trajectory = within(read_tum(folder / "trajectory.tum"), visit.reference)
         if session == 1:
             T_world_map = laid_on(trajectory, visit.reference)
-        points = transform(T_world_map, read_points(folder / "map.ply").astype(np.float64))
+        points = transform(T_world_map, read_map(folder / "map.ply").astype(np.float64))
         moved = Trajectory(trajectory.stamps, T_world_map @ trajectory.poses)
         maps.append(score_map(session, visit, points, moved))
         objects += meter.measure(visit, points)
@@ -138,7 +139,7 @@ def load_visit(folder: Path) -> Visit:
     """
     mesh = o3d.io.read_triangle_mesh(folder / WORLD_NAME)
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
-    surface = Surface(corners, read_points(folder / SURFACE_NAME).astype(np.float64))
+    surface = Surface(corners, read_map(folder / SURFACE_NAME).astype(np.float64))
     return Visit(read_movables(folder / MOVABLES_NAME), surface, read_tum(folder / TRUTH_NAME))
 
 

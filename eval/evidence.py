@@ -4,17 +4,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from evo.core.trajectory import PoseTrajectory3D
-from numpy.typing import NDArray
 
 from eval.files import GraphSketch, Timeline
 from eval.grid import Grid
+from eval.nearest import Points
 from eval.relations import Relations
 from eval.trajectory import TrajectoryComparison
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)  # one is equal to itself alone
 class Evidence:
     """The files of a run, read; None where there is none.
 
@@ -35,8 +34,8 @@ class Evidence:
     estimate: PoseTrajectory3D | None = None
     comparison: TrajectoryComparison | None = None
     relations: Relations | None = None
-    map: NDArray[np.float32] | None = None
-    reference_map: NDArray[np.float32] | None = None
+    map: Points | None = None
+    reference_map: Points | None = None
     grid: Grid | None = None
     reference_grid: Grid | None = None
     graph: GraphSketch | None = None

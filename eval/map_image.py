@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from eval.nearest import Points
+
 _SAMPLE = 200_000
 
 
@@ -25,7 +27,7 @@ class MapImage:
     cell: float
 
 
-def rasterise(points: NDArray[np.float32], pixels: int = 1100, finest: float = 0.1) -> MapImage:
+def rasterise(points: Points, pixels: int = 1100, finest: float = 0.1) -> MapImage:
     """Count (N, 3) points and average their heights in square cells.
 
     The farthest thousandth on each side lies outside, so that stray points don't shrink the rest.

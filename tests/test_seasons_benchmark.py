@@ -210,7 +210,7 @@ def test_maps_of_the_true_surface_follow_every_change(
         config = seasons.compose_config([*choice, *overrides]).scenario
         source = seasons.build(config)
         folder = tmp_path / f"session_{session}"
-        points = seasons.read_points(source.surface_path)[::3].astype(np.float64)
+        points = seasons.read_map(source.surface_path)[::3].astype(np.float64)
         write_ply(folder / "map.ply", transform(T_map_world, points).astype(np.float32))
         truth = source.reference()
         write_tum(folder / "trajectory.tum", Trajectory(truth.stamps, T_map_world @ truth.poses))
