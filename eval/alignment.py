@@ -21,6 +21,7 @@ Method = Literal["none", "first_pose", "se3", "yaw", "sim3"]
 
 _LINE = 0.01  # spread across a line, relative to the spread along it
 _FAR = 1000.0  # metres
+_STILL = 1e-6  # metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +44,12 @@ class Alignment:
 
     def apply(self, trajectory: PoseTrajectory3D) -> PoseTrajectory3D:
         """Return the trajectory in the reference's frame."""
-        quaternions = np.roll(trajectory.orientations_quat_wxyz, -1, axis=1)
-        turned = Rotation.from_matrix(self.R) * Rotation.from_quat(quaternions)
+        own = Rotation.from_quat(trajectory.orientations_quat_wxyz, scalar_first=True)
         return PoseTrajectory3D(
             self.move(trajectory.positions_xyz),
-            np.roll(turned.as_quat(), 1, axis=1),
+            (Rotation.from_matrix(self.R) * own).as_quat(scalar_first=True),
             trajectory.timestamps,
+            name=trajectory.name,
         )
 
     def move(self, positions: Array) -> Array:
@@ -68,10 +69,13 @@ def align(
             rotation about z and translation over all pairs; `sim3`, as se3 with a scale.
 
     Raises:
-        AlignmentError: the method is unknown, or a scale is asked of an estimate that stands still.
+        AlignmentError: the method is unknown, positions are NaN or infinite, or a scale is asked of an
+            estimate that stands still.
     """
     if method not in _SOLVERS:
         raise AlignmentError(f"unknown alignment {method!r}; there are: {', '.join(_SOLVERS)}")
+    if not all(np.isfinite(path.positions_xyz).all() for path in (estimate, reference)):
+        raise AlignmentError("positions that are NaN or infinite can't be aligned")
     R, t, scale = _SOLVERS[method](estimate, reference)
     found = Alignment(method, R, t, scale)
     warnings = tuple(_warnings(found, estimate.positions_xyz, reference.positions_xyz))
@@ -111,7 +115,7 @@ def _first_pose(
     estimate: PoseTrajectory3D, reference: PoseTrajectory3D
 ) -> tuple[Array, Array, float]:
     wxyz = np.stack([estimate.orientations_quat_wxyz[0], reference.orientations_quat_wxyz[0]])
-    first, target = Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix()
+    first, target = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
     R = target @ first.T
     return R, reference.positions_xyz[0] - R @ estimate.positions_xyz[0], 1.0
 
@@ -147,10 +151,11 @@ _SOLVERS: dict[str, _Solver] = {
 def _warnings(found: Alignment, source: Array, target: Array) -> list[str]:
     """Say what the positions leave undetermined, and what looks like a mix of frames."""
     warnings = []
-    moved = float(np.linalg.norm((found.move(source) - source).mean(axis=0)))
+    # The least, as a turn about the common start takes the far end of a long drive anywhere.
+    moved = float(np.linalg.norm(found.move(source) - source, axis=1).min())
     if moved > _FAR:
         warnings.append(
-            f"the alignment moves the estimate by {moved / 1000:.1f} km: do the frames fit?"
+            f"the alignment moves every pose by at least {moved / 1000:.1f} km: do the frames fit?"
         )
     if found.method not in ("se3", "sim3", "yaw"):
         return warnings
@@ -158,8 +163,13 @@ def _warnings(found: Alignment, source: Array, target: Array) -> list[str]:
     centred = (target - target.mean(axis=0))[:, :axes]
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(target))
     rmse = float(np.sqrt(((found.move(source) - target) ** 2).sum(axis=1).mean()))
-    if spread[0] <= max(rmse, 1e-6):
+    if spread[0] <= _STILL:
         warnings.append("the reference hardly moves: the alignment's rotation is not determined")
+    elif spread[0] <= rmse:
+        warnings.append(
+            f"errors ({rmse:.1f} m RMSE) are as large as the path (standard deviation {spread[0]:.1f} m):"
+            " the alignment's rotation is not determined"
+        )
     elif axes == 3 and spread[1] <= max(_LINE * spread[0], rmse):
         warnings.append(
             f"the path is nearly a straight line (standard deviations: {spread[0]:.1f} m along,"

@@ -59,29 +59,62 @@ def associate(
         max_gap: longest time in seconds between two reference poses to interpolate across.
 
     Raises:
-        AssociationError: fewer than three poses match.
+        AssociationError: fewer than three poses match, or stamps run back.
     """
     stamps, times = estimate.timestamps, reference.timestamps
+    if (np.diff(stamps) < 0).any() or (np.diff(times) < 0).any():
+        raise AssociationError("stamps run back; poses must be in order of time")
+    if times[-1] == times[0]:
+        raise AssociationError("the reference needs at least two poses at different instants")
     fresh = np.diff(stamps, prepend=-np.inf) > 0
-    inside = fresh & (stamps >= times[0] - _SAME) & (stamps <= times[-1] + _SAME)
-    after = np.clip(np.searchsorted(times, stamps), 1, max(len(times) - 1, 1))
-    if len(times) < 2:
-        raise AssociationError("the reference needs at least two poses")
-    gap = times[after] - times[after - 1]
-    nearest = np.minimum(np.abs(stamps - times[after]), np.abs(stamps - times[after - 1]))
-    dense = (gap <= max_gap) | (nearest <= _SAME)
+    within, gap = _surroundings(times, stamps)
+    inside, dense = fresh & within, gap <= max_gap
     matched = inside & dense
     if matched.sum() < _FEWEST:
-        raise AssociationError(_why(stamps, times, int(inside.sum()), gap[inside], max_gap))
+        raise AssociationError(
+            _why(stamps, times, int(inside.sum()), gap[inside & ~dense], max_gap)
+        )
     return Pairs(
         estimate=_select(estimate, matched),
-        reference=_interpolate(reference, stamps[matched]),
+        reference=interpolate(reference, stamps[matched]),
         stamped=True,
         estimated=len(stamps),
         outside=int((fresh & ~inside).sum()),
         in_gaps=int((inside & ~dense).sum()),
         repeated=int((~fresh).sum()),
         coverage=_coverage(stamps[matched], times),
+    )
+
+
+def within_reach(
+    trajectory: PoseTrajectory3D, stamps: NDArray[np.float64], max_gap: float = MAX_GAP
+) -> NDArray[np.bool_]:
+    """Return for each stamp whether the trajectory can be interpolated there.
+
+    Args:
+        trajectory: poses in order of time; nothing is within reach of a single one.
+        stamps: seconds, of any shape.
+        max_gap: longest time in seconds between two poses to interpolate across.
+    """
+    times = trajectory.timestamps
+    within, gap = _surroundings(times, stamps)
+    reached: NDArray[np.bool_] = within & (gap <= max_gap) & (times[0] < times[-1])
+    return reached
+
+
+def interpolate(trajectory: PoseTrajectory3D, stamps: NDArray[np.float64]) -> PoseTrajectory3D:
+    """Return the trajectory at (M,) stamps that lie within it, give or take a microsecond."""
+    unique = np.diff(trajectory.timestamps, prepend=-np.inf) > 0
+    times = trajectory.timestamps[unique]
+    within = np.clip(stamps, times[0], times[-1])
+    wxyz = trajectory.orientations_quat_wxyz[unique]
+    rotations = Slerp(times, Rotation.from_quat(wxyz, scalar_first=True))(within)
+    positions = trajectory.positions_xyz[unique]
+    return PoseTrajectory3D(
+        np.column_stack([np.interp(within, times, positions[:, axis]) for axis in range(3)]),
+        rotations.as_quat(scalar_first=True),
+        stamps,
+        name=trajectory.name,
     )
 
 
@@ -99,13 +132,16 @@ def pair_by_index(estimate: PosePath3D, reference: PosePath3D) -> Pairs:
         )
     if count < _FEWEST:
         raise AssociationError(f"{count} poses are too few to compare; it takes {_FEWEST}")
-    everything = np.ones(count, dtype=bool)
     counted = [
-        PoseTrajectory3D(p.positions_xyz, p.orientations_quat_wxyz, np.arange(count, dtype=float))
-        for p in (estimate, reference)
+        PoseTrajectory3D(
+            path.positions_xyz,
+            path.orientations_quat_wxyz,
+            np.arange(count, dtype=float),
+            name=path.name,
+        )
+        for path in (estimate, reference)
     ]
-    first, second = (_select(trajectory, everything) for trajectory in counted)
-    return Pairs(first, second, False, count, 0, 0, 0, 1.0)
+    return Pairs(counted[0], counted[1], False, count, 0, 0, 0, 1.0)
 
 
 def _select(trajectory: PoseTrajectory3D, chosen: NDArray[np.bool_]) -> PoseTrajectory3D:
@@ -113,22 +149,21 @@ def _select(trajectory: PoseTrajectory3D, chosen: NDArray[np.bool_]) -> PoseTraj
         trajectory.positions_xyz[chosen],
         trajectory.orientations_quat_wxyz[chosen],
         trajectory.timestamps[chosen],
+        name=trajectory.name,
     )
 
 
-def _interpolate(reference: PoseTrajectory3D, stamps: NDArray[np.float64]) -> PoseTrajectory3D:
-    """Return the reference at stamps that lie within it, give or take a microsecond."""
-    unique = np.diff(reference.timestamps, prepend=-np.inf) > 0
-    times = reference.timestamps[unique]
-    within = np.clip(stamps, times[0], times[-1])
-    quaternions = np.roll(reference.orientations_quat_wxyz[unique], -1, axis=1)
-    rotations = Slerp(times, Rotation.from_quat(quaternions))(within)
-    positions = reference.positions_xyz[unique]
-    return PoseTrajectory3D(
-        np.column_stack([np.interp(within, times, positions[:, axis]) for axis in range(3)]),
-        np.roll(rotations.as_quat(), 1, axis=1),
-        stamps,
-    )
+def _surroundings(
+    times: NDArray[np.float64], stamps: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return for each stamp whether it lies within the times, and the gap there in seconds.
+
+    At one of the times, the gap is 0.
+    """
+    within = (stamps >= times[0] - _SAME) & (stamps <= times[-1] + _SAME)
+    after = np.clip(np.searchsorted(times, stamps), 1, len(times) - 1)
+    nearest = np.minimum(np.abs(stamps - times[after]), np.abs(stamps - times[after - 1]))
+    return within, np.where(nearest <= _SAME, 0.0, times[after] - times[after - 1])
 
 
 def _coverage(matched: NDArray[np.float64], times: NDArray[np.float64]) -> float:

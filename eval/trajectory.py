@@ -1,39 +1,19 @@
-"""Judges a trajectory against a reference: paper 000, section 4.1, and evo's and KITTI's errors."""
+"""Compares a trajectory to a reference (paper 000, section 4.1)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from evo.core.trajectory import PoseTrajectory3D
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eval import relative
 from eval.alignment import Alignment, Method, align
 from eval.association import MAX_GAP, Pairs, associate
 
 Array = NDArray[np.float64]
 
-PERCENTILES = (50, 75, 90, 95, 99)
-RPE_METRES = (1.0, 10.0)
-RPE_SECONDS = 1.0
-# What needs a reference, and is null without one.
-REFERENCED = (
-    "mae_m",
-    "mae_x_m",
-    "mae_y_m",
-    "mae_z_m",
-    "mse_m2",
-    "rmse_m",
-    "max_m",
-    "percentiles_m",
-    "ape_translation_m",
-    "ape_rotation_deg",
-    "rpe",
-    "kitti",
-    "coverage",
-    "alignment",
-)
+_FEW = 0.5  # share that should at least have been compared
+_TINY = 10  # poses; an alignment has up to seven degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +41,40 @@ class TrajectoryComparison:
     def errors(self) -> Array:
         """(N,) Euclidean position errors e_i in metres."""
         return np.asarray(np.linalg.norm(self.differences, axis=1))
+
+    @property
+    def rotation_errors(self) -> Array:
+        """(N,) angles of ``R_estimate^-1 R_reference`` in degrees, as evo's APE has them."""
+        quaternions = (t.orientations_quat_wxyz for t in (self.estimate, self.reference))
+        estimated, true = (Rotation.from_quat(q, scalar_first=True) for q in quaternions)
+        angles: Array = np.degrees((estimated.inv() * true).magnitude())
+        return angles
+
+    @property
+    def seconds(self) -> Array:
+        """(N,) seconds since the first pair; poses, if there are no stamps."""
+        return np.asarray(self.reference.timestamps - self.reference.timestamps[0])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes all errors doubtful: an odd alignment, or how little was compared."""
+        pairs, warnings = self.pairs, [*self.alignment.warnings]
+        matched = pairs.estimate.num_poses
+        if matched < _FEW * pairs.estimated:
+            warnings.append(
+                f"only {matched} of {pairs.estimated} estimated poses were compared:"
+                f" {pairs.outside} lie outside the reference's time, {pairs.in_gaps} in its gaps,"
+                f" {pairs.repeated} repeat a stamp"
+            )
+        if matched < _TINY:
+            warnings.append(
+                f"only {matched} poses were compared: the alignment makes so few fit, however wrong"
+            )
+        if pairs.coverage < _FEW:
+            warnings.append(
+                f"the estimate covers only {100 * pairs.coverage:.0f} % of the reference's duration"
+            )
+        return tuple(warnings)
 
     @property
     def distances(self) -> Array:
@@ -94,70 +108,3 @@ def compare_pairs(pairs: Pairs, alignment: Method = "se3") -> TrajectoryComparis
     return TrajectoryComparison(
         pairs, found, aligned, aligned.positions_xyz - pairs.reference.positions_xyz
     )
-
-
-def trajectory_metrics(comparison: TrajectoryComparison) -> dict[str, Any]:
-    """Return the metrics of section `trajectory` in metrics.json; units are in the names.
-
-    Relative errors are null where the path or the time is too short for them.
-    """
-    errors, differences = comparison.errors, np.abs(comparison.differences)
-    mean_axes = differences.mean(axis=0).tolist()
-    return {
-        "mae_m": float(errors.mean()),
-        "mae_x_m": mean_axes[0],
-        "mae_y_m": mean_axes[1],
-        "mae_z_m": mean_axes[2],
-        "mse_m2": float((errors**2).mean()),
-        "rmse_m": float(np.sqrt((errors**2).mean())),
-        "max_m": float(errors.max()),
-        "percentiles_m": {
-            str(p): float(value)
-            for p, value in zip(PERCENTILES, np.percentile(errors, PERCENTILES), strict=True)
-        },
-        "ape_translation_m": relative.summary(errors),
-        "ape_rotation_deg": relative.summary(_rotation_errors(comparison)),
-        "rpe": _rpe(comparison),
-        "kitti": relative.kitti(comparison.estimate, comparison.reference),
-        **_extent(comparison),
-    }
-
-
-def _rotation_errors(comparison: TrajectoryComparison) -> Array:
-    """Return the (N,) angles in degrees of ``R_estimate^-1 R_reference``, as evo's APE has them."""
-    wxyz = (t.orientations_quat_wxyz for t in (comparison.estimate, comparison.reference))
-    estimated, true = (Rotation.from_quat(np.roll(q, -1, axis=1)) for q in wxyz)
-    angles: Array = np.degrees((estimated.inv() * true).magnitude())
-    return angles
-
-
-def _rpe(comparison: TrajectoryComparison) -> dict[str, Any]:
-    pair = (comparison.estimate, comparison.reference)
-    by_delta = {f"{delta:g} m": relative.rpe_by_distance(*pair, delta) for delta in RPE_METRES}
-    if comparison.pairs.stamped:
-        by_delta[f"{RPE_SECONDS:g} s"] = relative.rpe_by_time(*pair, RPE_SECONDS)
-    return by_delta
-
-
-def _extent(comparison: TrajectoryComparison) -> dict[str, Any]:
-    """Say what was compared, and how it was aligned."""
-    pairs, alignment = comparison.pairs, comparison.alignment
-    return {
-        "path_length_m": float(pairs.estimate.path_length),
-        "reference_path_length_m": float(pairs.reference.path_length),
-        "poses": {
-            "estimated": pairs.estimated,
-            "matched": int(pairs.estimate.num_poses),
-            "outside_reference": pairs.outside,
-            "in_reference_gaps": pairs.in_gaps,
-            "repeated_stamps": pairs.repeated,
-        },
-        "coverage": pairs.coverage,
-        "alignment": {
-            "method": alignment.method,
-            "rotation": alignment.R.tolist(),
-            "translation_m": alignment.t.tolist(),
-            "scale": alignment.scale,
-        },
-        "warnings": list(alignment.warnings),
-    }

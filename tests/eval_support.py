@@ -4,6 +4,8 @@ import numpy as np
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
+from eval.evidence import Evidence
+
 
 def make(positions, rotations=None, stamps=None):
     positions = np.asarray(positions, dtype=float)
@@ -32,3 +34,10 @@ def disturbed(reference, seed=1, size=0.1):
     rotations = turn * Rotation.from_quat(quaternions) * wobble
     moved = turn.apply(reference.positions_xyz + noise) + np.array([5.0, -3.0, 2.0])
     return make(moved, rotations, reference.timestamps)
+
+
+def values_of(metric, **evidence):
+    """What a metric says, which must be what it promises to say."""
+    values = metric.measure(Evidence(**evidence)).values
+    assert set(values) == set(metric.keys)
+    return values

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from eval_support import disturbed, make, winding
+from eval_support import disturbed, make, values_of, winding
 from evo.core.geometry import umeyama_alignment
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from eval.alignment import align, kabsch
 from eval.association import associate, pair_by_index
 from eval.errors import AlignmentError, AssociationError
-from eval.trajectory import compare_trajectories, trajectory_metrics
+from eval.evidence import Evidence
+from eval.metrics.trajectory import Coverage, PositionError, RotationError
+from eval.trajectory import compare_trajectories
 
 
 def test_reference_is_interpolated_at_the_estimates_stamps():
@@ -58,6 +60,25 @@ def test_too_few_matches_are_an_error_that_says_why(stamps, message):
 def test_a_reference_of_one_pose_is_an_error():
     with pytest.raises(AssociationError, match="at least two"):
         associate(make(np.zeros((3, 3))), make(np.zeros((1, 3))))
+
+
+def test_a_reference_that_stands_still_in_time_is_an_error():
+    with pytest.raises(AssociationError, match="different instants"):
+        associate(make(np.zeros((3, 3))), make(np.zeros((3, 3)), stamps=[1.0, 1.0, 1.0]))
+
+
+@pytest.mark.parametrize("back", [0, 1])
+def test_stamps_that_run_back_are_an_error(back):
+    pair = [make(np.zeros((4, 3))), make(np.zeros((4, 3)))]
+    pair[back] = make(np.zeros((4, 3)), stamps=[0.0, 0.2, 0.1, 0.3])
+    with pytest.raises(AssociationError, match="order of time"):
+        associate(*pair)
+
+
+def test_too_sparse_a_reference_is_called_so_beside_poses_that_match_exactly():
+    reference = make(np.zeros((5, 3)), stamps=np.arange(5))
+    with pytest.raises(AssociationError, match=r"1\.000 s apart"):
+        associate(make(np.zeros((4, 3)), stamps=[0.0, 1.0, 1.5, 2.5]), reference)
 
 
 def test_poses_without_stamps_need_equal_counts():
@@ -114,9 +135,10 @@ def test_yaw_alignment_keeps_the_estimates_tilt():
         turn * Rotation.from_quat(quaternions),
         reference.timestamps,
     )
-    metrics = trajectory_metrics(compare_trajectories(turned, reference, "yaw"))
-    assert metrics["max_m"] < 1e-9
-    assert metrics["ape_rotation_deg"]["max"] < 1e-6
+    comparison = compare_trajectories(turned, reference, "yaw")
+    assert values_of(PositionError(), comparison=comparison)["max_m"] < 1e-9
+    angles = values_of(RotationError(), comparison=comparison)["ape_rotation_deg"]
+    assert angles["max"] < 1e-6
     tilted = make(
         Rotation.from_euler("x", 0.1).apply(turned.positions_xyz), None, turned.timestamps
     )
@@ -167,6 +189,53 @@ def test_kilometres_of_alignment_are_suspicious():
     assert "400.0 km" in " ".join(compare_trajectories(far, reference).alignment.warnings)
 
 
+@pytest.mark.parametrize("method", ["se3", "sim3", "yaw", "first_pose"])
+def test_a_long_drive_with_another_heading_is_not_suspicious(method):
+    path = winding(count=3000, rate=1.0)
+    turn = Rotation.from_euler("z", 3.0)
+    turned = make(turn.apply(path.positions_xyz), None, path.timestamps)
+    reference = make(path.positions_xyz, None, path.timestamps)
+    assert np.linalg.norm(turned.positions_xyz - reference.positions_xyz, axis=1).mean() > 1000
+    warnings = compare_trajectories(turned, reference, method, max_gap=2.0).warnings
+    assert not any("km" in warning for warning in warnings)
+
+
+def test_an_estimate_that_stands_still_while_the_reference_moves_is_doubtful():
+    reference = winding()
+    still = make(np.zeros((reference.num_poses, 3)), stamps=reference.timestamps)
+    assert "as large as the path" in " ".join(compare_trajectories(still, reference).warnings)
+
+
+def test_little_overlap_is_doubtful():
+    reference = winding()
+    late = make(reference.positions_xyz, stamps=reference.timestamps + 30)
+    warnings = compare_trajectories(late, reference).warnings
+    assert "only 100 of 400 estimated poses were compared: 300 lie outside" in " ".join(warnings)
+    assert "covers only 25 % of the reference's duration" in " ".join(warnings)
+
+
+def test_a_handful_of_poses_is_doubtful():
+    reference = winding(9)
+    assert "only 9 poses" in " ".join(compare_trajectories(reference, reference).warnings)
+
+
+@pytest.mark.parametrize("metric", [PositionError(), RotationError(), Coverage()])
+def test_what_makes_a_comparison_doubtful_is_said_with_its_errors(metric):
+    reference = winding()
+    far = make(reference.positions_xyz + np.array([400_000, 0, 0]), stamps=reference.timestamps)
+    warnings = metric.measure(Evidence(comparison=compare_trajectories(far, reference))).warnings
+    assert any("400.0 km" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("method", ["none", "se3"])
+def test_what_is_no_number_is_never_aligned(value, method):
+    reference = winding(10)
+    broken = make(np.where(np.eye(10, 3) > 0, value, reference.positions_xyz))
+    with pytest.raises(AlignmentError, match="NaN"):
+        compare_trajectories(broken, reference, method)
+
+
 def test_a_good_run_has_no_warnings():
     reference = winding()
-    assert compare_trajectories(disturbed(reference), reference).alignment.warnings == ()
+    assert compare_trajectories(disturbed(reference), reference).warnings == ()
