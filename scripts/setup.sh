@@ -6,7 +6,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=.venv
 stamp=$venv/.installed
-extras=dev,kiss-slam,rerun
+extras=dev,kiss-slam,rerun,joblib,ray,slurm
 # The shared libraries that Open3D links to beyond those of any system, and their Debian packages.
 libraries="libEGL.so.1=libegl1 libGL.so.1=libgl1 libX11.so.6=libx11-6 libidn2.so.0=libidn2-0
            libstdc++.so.6=libstdc++6 libudev.so.1=libudev1 libusb-1.0.so.0=libusb-1.0-0"
@@ -63,12 +63,15 @@ main() {
     packages=$(missing_packages "$python")
     # shellcheck disable=SC2086 # one word a package
     [[ -z $packages ]] || install_packages $packages
+    # A browser is for tests alone, which are skipped without it.
+    command -v chromium >/dev/null || (install_packages chromium) ||
+        echo "setup: going on without chromium: the tests of reports in a browser will be skipped" >&2
     if [[ $python != "$venv/bin/python" ]]; then
         "$python" -m venv --clear "$venv"
     fi
     wanted="$(cksum <pyproject.toml) $extras $PWD"
     if [[ $(cat "$stamp" 2>/dev/null || true) != "$wanted" ]]; then
-        echo "setup: installing Python packages into $venv (about 3 GB; a minute or more)"
+        echo "setup: installing Python packages into $venv (about 3.4 GB; a minute or more)"
         "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".[$extras]"
         echo "$wanted" >"$stamp"
     fi

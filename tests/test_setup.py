@@ -44,7 +44,7 @@ def setup(tmp_path):
         (tools / name).write_text(text)
         (tools / name).chmod(0o755)
 
-    def call(libraries=LIBRARIES, root=False, sudo=False, apt=True, **environment):
+    def call(libraries=LIBRARIES, root=False, sudo=False, apt=True, chromium=True, **environment):
         log.write_text("")
         listed = "\\n".join(f"\tlib{name} (libc6) => /lib/lib{name}" for name in libraries)
         tool("python3", PYTHON)
@@ -54,6 +54,8 @@ def setup(tmp_path):
         tool("sudo", f"#!/bin/sh\n{allowed}\n")
         if apt:
             tool("apt-get", '#!/bin/sh\necho "apt-get $*" >>"$LOG"\n')
+        if chromium:
+            tool("chromium", "#!/bin/sh\n")
         defaults = {"HAS_VENV": "yes", "GOOD_PYTHON": "yes", "LOG": str(log)}
         done = subprocess.run(
             [project / "scripts" / "setup.sh"],
@@ -109,6 +111,21 @@ def test_names_the_packages_where_there_is_no_apt(setup):
     done, _ = setup(libraries=LIBRARIES[1:], apt=False)
     assert done.returncode != 0
     assert "install what Debian calls: libegl1" in done.stderr
+
+
+def test_installs_a_browser_where_it_may(setup):
+    done, log = setup(chromium=False, root=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert any(line.endswith(" chromium") for line in log.splitlines())
+
+
+@pytest.mark.parametrize("apt", [True, False])
+def test_goes_on_without_a_browser_and_says_so(setup, apt):
+    done, log = setup(chromium=False, apt=apt)
+    assert done.returncode == 0
+    assert "chromium" in done.stderr
+    assert "will be skipped" in done.stderr
+    assert "pip install" in log
 
 
 def test_says_which_pythons_will_do(setup):
