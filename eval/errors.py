@@ -15,3 +15,11 @@ class AssociationError(EvalError):
 
 class AlignmentError(EvalError):
     """The alignment asked for is unknown or has no solution."""
+
+
+class EvidenceError(EvalError):
+    """The evidence lacks what a metric asks of it."""
+
+
+class MetricError(EvalError):
+    """A metric can't be made from its settings, or breaks the contract of `eval.metrics.metric`."""

@@ -1,8 +1,4 @@
-"""Reads the standard files that SLAM systems leave behind, and writes the verdict.
-
-Trajectories are evo's `PoseTrajectory3D`. Of evo, only `core` and `tools.file_interface` are
-imported: they neither read nor write evo's settings in the user's home.
-"""
+"""Reads the standard files that SLAM systems leave behind, and writes the verdict."""
 
 import csv
 import json
@@ -16,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from evo import EvoException
-from evo.core.trajectory import PosePath3D, PoseTrajectory3D
-from evo.tools import file_interface
 from numpy.typing import NDArray
 
 from eval.errors import FileError
@@ -39,57 +32,6 @@ class GraphSketch:
     positions: NDArray[np.float64]
     edges: NDArray[np.int64]
     is_loop: NDArray[np.bool_]
-
-
-def read_tum(path: Path) -> PoseTrajectory3D:
-    """Read a TUM trajectory, ``stamp[s] x y z qx qy qz qw`` a line.
-
-    Raises:
-        FileError: the file is missing or malformed, holds NaN, or its stamps run back.
-    """
-    _require(path, "trajectory")
-    try:
-        trajectory = file_interface.read_tum_trajectory_file(str(path))
-    except (EvoException, ValueError, UnicodeDecodeError) as error:
-        raise FileError(f"{path} is not a TUM trajectory: {error}") from error
-    _check_finite(path, trajectory)
-    stamps = trajectory.timestamps
-    if not np.isfinite(stamps).all() or (np.diff(stamps) < 0).any():
-        raise FileError(f"{path}: stamps must not run back or be NaN")
-    return trajectory
-
-
-def read_kitti(path: Path) -> PosePath3D:
-    """Read a KITTI trajectory: the 12 numbers of a 3x4 pose a line, no stamps.
-
-    Raises:
-        FileError: the file is missing or malformed, or holds NaN.
-    """
-    _require(path, "trajectory")
-    try:
-        trajectory = file_interface.read_kitti_poses_file(str(path))
-    except (EvoException, ValueError, UnicodeDecodeError) as error:
-        raise FileError(f"{path} is not a KITTI trajectory: {error}") from error
-    _check_finite(path, trajectory)
-    return trajectory
-
-
-def read_points(path: Path) -> NDArray[np.float32]:
-    """Read the (N, 3) points of a PLY, PCD or other cloud that Open3D knows, in metres.
-
-    Raises:
-        FileError: the file is missing or holds no points that Open3D can read.
-    """
-    import open3d as o3d  # takes a second: not where only trajectories are compared
-
-    _require(path, "map")
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(path)
-    if "positions" not in cloud.point:
-        if _says_empty(path):
-            return np.zeros((0, 3), dtype=np.float32)
-        raise FileError(f"{path} holds no points that Open3D can read")
-    return np.asarray(cloud.point.positions.numpy(), dtype=np.float32)
 
 
 def read_graph(path: Path) -> GraphSketch:
@@ -193,14 +135,3 @@ def _sketch(
 def _require(path: Path, what: str) -> None:
     if not path.is_file():
         raise FileError(f"no such {what} file: {path}")
-
-
-def _check_finite(path: Path, trajectory: PosePath3D) -> None:
-    if not np.isfinite(trajectory.positions_xyz).all():
-        raise FileError(f"{path} holds NaN or infinite positions")
-
-
-def _says_empty(path: Path) -> bool:
-    """Whether a PLY header announces no vertices."""
-    with path.open("rb") as file:
-        return b"element vertex 0\n" in file.read(1000)

@@ -1,5 +1,6 @@
 """Pictures of a run, as Matplotlib figures that need neither a display nor global state."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,15 +12,18 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from eval.files import GraphSketch, Timeline, atomic_path
+from eval.files import GraphSketch, atomic_path
 from eval.map_image import rasterise
+from eval.metrics.metric import Curve, Plot
+from eval.nearest import Points
+from eval.report.encoding import thin
 from eval.trajectory import TrajectoryComparison
 
 Array = NDArray[np.float64]
 
 _ESTIMATE, _REFERENCE, _LOOP = "#1668b3", "#6b6f76", "#e8590c"
-_STAGE_COLOURS = ("#1668b3", "#e8590c", "#2b8a3e", "#9c36b5")
-_AXIS_COLOURS = {"x": "#c92a2a", "y": "#2b8a3e", "z": "#1668b3"}
+_COLOURS = ("#1668b3", "#e8590c", "#2b8a3e", "#9c36b5", "#c92a2a", "#0b7285")
+_STACKED = 300  # steps that a stack of curves has on paper
 _WIDTH = 9.0  # inches
 _DPI = 130
 
@@ -32,26 +36,31 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def trajectory(
-    estimate: PoseTrajectory3D, comparison: TrajectoryComparison | None, graph: GraphSketch
+    estimate: PoseTrajectory3D, comparison: TrajectoryComparison | None, graph: GraphSketch | None
 ) -> Figure:
     """Draw the path from above, with reference and loop closures, over its height profile."""
     path = estimate.positions_xyz
-    vertices = graph.positions
     title = f"Trajectory, {estimate.path_length:.0f} m; no reference"
     if comparison is not None:
         path = comparison.alignment.move(path)
-        vertices = comparison.alignment.move(vertices)
         mae = comparison.errors.mean()
         title = f"Trajectory, {estimate.path_length:.0f} m: mean absolute error {mae:.3f} m"
     figure = Figure(figsize=(_WIDTH, _height(path) + 2.6), layout="constrained")
     above, profile = figure.subplots(2, 1, height_ratios=[_height(path), 1.8])
     if comparison is not None:
         true = comparison.reference.positions_xyz
-        above.plot(true[:, 0], true[:, 1], color=_REFERENCE, lw=4, alpha=0.45, label="reference")
-        profile.plot(comparison.distances, true[:, 2], color=_REFERENCE, lw=4, alpha=0.45)
-    above.plot(path[:, 0], path[:, 1], color=_ESTIMATE, lw=1.3, label="estimate")
-    profile.plot(_along(path), path[:, 2], color=_ESTIMATE, lw=1.3)
-    _draw_loops(above, vertices, graph)
+        kept = thin(true.sum(axis=1))
+        behind = {"color": _REFERENCE, "lw": 4, "alpha": 0.45}
+        above.plot(true[kept, 0], true[kept, 1], label="reference", **behind)
+        profile.plot(comparison.distances[kept], true[kept, 2], **behind)
+    kept = thin(path.sum(axis=1))
+    above.plot(path[kept, 0], path[kept, 1], color=_ESTIMATE, lw=1.3, label="estimate")
+    profile.plot(_along(path)[kept], path[kept, 2], color=_ESTIMATE, lw=1.3)
+    if graph is not None:
+        vertices = graph.positions
+        if comparison is not None:
+            vertices = comparison.alignment.move(vertices)
+        _draw_loops(above, vertices, graph)
     above.plot(*path[0, :2], "o", ms=8, color=_ESTIMATE, mec="white", mew=1.5, label="start")
     above.plot(*path[-1, :2], "s", ms=7, color=_ESTIMATE, mec="white", mew=1.5, label="end")
     above.set_aspect("equal", adjustable="datalim")
@@ -61,85 +70,45 @@ def trajectory(
     return figure
 
 
-def errors(comparison: TrajectoryComparison) -> Figure:
-    """Draw position error over time and over distance, and each axis's share of it."""
-    figure = Figure(figsize=(_WIDTH, 7.5), layout="constrained")
-    over_time, over_distance, by_axis = figure.subplots(3, 1)
-    seconds = comparison.reference.timestamps - comparison.reference.timestamps[0]
-    values = comparison.errors
-    mae, rmse = values.mean(), np.sqrt((values**2).mean())
-    for axes, along in ((over_time, seconds), (over_distance, comparison.distances)):
-        axes.fill_between(along, values, color=_ESTIMATE, alpha=0.15, lw=0)
-        axes.plot(along, values, color=_ESTIMATE, lw=1.3)
-        axes.axhline(mae, color=_LOOP, lw=1.2, ls="--", label=f"mean {mae:.3f} m")
-        axes.set_ylim(bottom=0)
-    unit = "time since the first pair [s]" if comparison.pairs.stamped else "pose"
-    title = f"Position error: MAE {mae:.3f} m, RMSE {rmse:.3f} m, max {values.max():.3f} m"
-    _label(over_time, unit, "error [m]", title)
-    _label(over_distance, "distance along the reference [m]", "error [m]", "")
-    for index, (name, colour) in enumerate(_AXIS_COLOURS.items()):
-        share = comparison.differences[:, index]
-        label = f"{name}: MAE {np.abs(share).mean():.3f} m"
-        by_axis.plot(comparison.distances, share, color=colour, lw=1.1, label=label)
-    by_axis.axhline(0, color="black", lw=0.6)
-    _label(
-        by_axis,
-        "distance along the reference [m]",
-        "estimate - reference [m]",
-        "By axis of the reference",
-    )
-    _legend(over_time)
-    _legend(by_axis)
-    return figure
-
-
-def growth(timeline: Timeline) -> Figure:
-    """Draw graph size and memory over the scans."""
-    figure = Figure(figsize=(_WIDTH, 5.5), layout="constrained")
-    size, memory = figure.subplots(2, 1, sharex=True)
-    scans = np.arange(1, len(timeline["stamp"]) + 1)
-    for column, colour in (("vertices", _ESTIMATE), ("edges", _LOOP)):
-        last = f"{timeline[column][-1]:.0f}" if len(scans) else "none"
-        size.plot(scans, timeline[column], color=colour, lw=1.5, label=f"{column}: {last}")
-    memory.plot(scans, timeline["rss_mb"], color="#495057", lw=1.5)
-    size.set_ylim(bottom=0)
-    memory.set_ylim(bottom=0)
-    peak = timeline["rss_mb"].max() if len(scans) else 0
-    _label(size, "", "count", "Graph growth")
-    _label(memory, "scan", "resident memory [MB]", f"Memory, at most {peak:.0f} MB")
-    _legend(size)
-    return figure
-
-
-def stages(timeline: Timeline, names: tuple[str, ...]) -> Figure:
-    """Draw the time of each stage, stacked over the scans (averaged where there are many)."""
+def declared(plot: Plot) -> Figure:
+    """Draw what a metric declares: lines over each other, or stacked as shares of a whole."""
     figure = Figure(figsize=(_WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
-    present = [name for name in names if f"{name}_ms" in timeline]
-    values = np.array([timeline[f"{name}_ms"] for name in present]).reshape(len(present), -1)
-    mean = values.mean(axis=1) if values.size else np.zeros(len(present))
-    group = max(1, values.shape[1] // 300)
-    starts = np.arange(0, values.shape[1], group)
-    if len(starts):
-        sizes = np.diff(np.append(starts, values.shape[1]))
-        averaged = np.add.reduceat(values, starts, axis=1) / sizes
-        labels = [f"{name}: {ms:.1f} ms" for name, ms in zip(present, mean, strict=True)]
-        colours = _STAGE_COLOURS[: len(present)]
-        axes.stackplot(starts + 1, averaged, labels=labels, colors=colours, alpha=0.85, lw=0)
-        axes.set_xlim(1, max(2, starts[-1] + 1))
-        axes.set_ylim(0, max(1.25 * averaged.sum(axis=0).max(), 1e-3))  # room for the legend
-    note = "" if group == 1 else f", means over {group} scans"
-    _label(axes, "scan", "time [ms]", f"Time per stage: {mean.sum():.1f} ms a scan{note}")
-    _legend(axes, columns=len(names), place="upper center")
+    colours = [_COLOURS[i % len(_COLOURS)] for i in range(len(plot.curves))]
+    if plot.stacked:
+        _stack(axes, plot.curves, colours)
+    else:
+        for curve, colour in zip(plot.curves, colours, strict=True):
+            shown = thin(curve.y)
+            axes.plot(curve.x[shown], curve.y[shown], color=colour, lw=1.3, label=curve.name)
+    low, high = axes.get_ylim()
+    if all(np.nanmin(curve.y, initial=0) >= 0 for curve in plot.curves):
+        axes.set_ylim(0, high + 0.2 * (high - max(low, 0)))  # room for the legend
+    _label(axes, plot.x_label, plot.y_label, plot.title)
+    if len(plot.curves) > 1:
+        _legend(axes, columns=min(len(plot.curves), 4), place="upper center")
     return figure
 
 
-def map_from_above(points: NDArray[np.float32], path: Array) -> Figure:
+def _stack(axes: Axes, curves: Sequence[Curve], colours: Sequence[str]) -> None:
+    """Stack curves over their common abscissae, as means of groups where there are many."""
+    x, values = curves[0].x, np.array([np.nan_to_num(curve.y) for curve in curves])
+    if len(x) == 0:
+        return
+    starts = np.arange(0, len(x), max(1, len(x) // _STACKED))
+    sizes = np.diff(np.append(starts, len(x)))
+    means = np.add.reduceat(values, starts, axis=1) / sizes
+    labels = [curve.name for curve in curves]
+    axes.stackplot(x[starts], means, labels=labels, colors=colours, alpha=0.85, lw=0)
+    axes.margins(x=0)
+
+
+def map_from_above(points: Points, path: Array) -> Figure:
     """Draw a map from above, coloured by height and fainter where there are few points.
 
     Args:
         points: (N, 3) map in metres.
-        path: (M, 3) positions driven, in the same frame.
+        path: (M, 3) positions driven, in the same frame; may be empty.
     """
     shape = path if len(points) == 0 else points[:: max(1, len(points) // 10_000)].astype(float)
     figure = Figure(figsize=(_WIDTH, 0.85 * _height(shape) + 0.8), layout="constrained")
@@ -161,8 +130,9 @@ def map_from_above(points: NDArray[np.float32], path: Array) -> Figure:
             interpolation="nearest",
         )
         figure.colorbar(shown, ax=axes, label="mean height z [m]", shrink=0.8, pad=0.01)
-    axes.plot(path[:, 0], path[:, 1], color="black", lw=1.2, label="path")
-    axes.plot(*path[0, :2], "o", ms=7, color="black", mec="white", mew=1.5, label="start")
+    if len(path):
+        axes.plot(path[:, 0], path[:, 1], color="black", lw=1.2, label="path")
+        axes.plot(*path[0, :2], "o", ms=7, color="black", mec="white", mew=1.5, label="start")
     axes.set_aspect("equal", adjustable="datalim")
     _label(axes, "x [m]", "y [m]", f"Map from above: {len(points):,} points{cell}")
     axes.grid(False)  # it would shine through the cells
@@ -197,6 +167,8 @@ def _along(path: Array) -> Array:
 
 def _height(path: Array) -> float:
     """Return inches that show a path of this shape well at the figure's width."""
+    if len(path) == 0:
+        return _WIDTH / 2
     extent = np.ptp(path[:, :2], axis=0)
     return float(np.clip(_WIDTH * extent[1] / max(extent[0], 1e-9), 2.5, 9.0))
 

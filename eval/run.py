@@ -1,79 +1,64 @@
-"""Evaluates a run folder: metrics.json and plots/ from the files that a run left."""
+"""Evaluates a run folder: metrics.json, plots/ and report.html from the files that a run left."""
 
 import json
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from evo.core.trajectory import PoseTrajectory3D
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from eval import plots
-from eval.alignment import Method
-from eval.errors import AlignmentError, AssociationError
-from eval.files import (
-    GraphSketch,
-    Timeline,
-    read_graph,
-    read_points,
-    read_timeline,
-    read_tum,
-    write_json,
-)
-from eval.trajectory import (
-    REFERENCED,
-    TrajectoryComparison,
-    compare_trajectories,
-    trajectory_metrics,
-)
+from eval.evaluation import Settings, Verdict, evaluate, to_sections
+from eval.evidence import Evidence
+from eval.evidence_files import EvidenceFiles, read_evidence
+from eval.files import write_json
 
 _log = logging.getLogger(__name__)
 
-STAGES = ("odometry", "loop", "optimise", "prune")
+REFERENCE_MAP = "reference_map.ply"
 
 
 def evaluate_run(
-    folder: Path, run_info: dict[str, Any] | None = None, alignment: Method = "se3"
+    folder: Path, settings: Settings, run_info: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Read the files of a run folder, write metrics.json and plots/ into it, return the metrics.
+    """Read the files of a run folder, write the results into it, return the metrics.
 
-    What can't be computed is null, with the reason beside it; everything else is still there.
+    What can't be measured is null, with the reason beside it; everything else is still there.
 
     Args:
         folder: a run folder with trajectory.tum, map.ply, pose_graph.g2o and timeline.csv, and
-            reference.tum where there is one.
+            where there are some to trust, reference.tum and reference_map.ply.
+        settings: what to judge by.
         run_info: section `run` of metrics.json, such as versions, seed and machine; without it,
-            that of an earlier metrics.json is kept. Its `wall_seconds`, `peak_rss_mb` and
-            `cpu_percent`, where present, also go into section `resources`.
-        alignment: how the estimate is moved onto the reference.
+            that of an earlier metrics.json is kept.
 
     Raises:
-        FileError: a file of the run folder is missing or malformed; the reference may be missing.
+        FileError: a file of the run folder is missing or malformed; the references may be missing.
+        MetricError: a metric breaks its contract.
     """
-    run_info = _earlier_info(folder) if run_info is None else run_info
-    estimate = read_tum(folder / "trajectory.tum")
-    graph = read_graph(folder / "pose_graph.g2o")
-    points = read_points(folder / "map.ply")
-    timeline = read_timeline(folder / "timeline.csv")
-    comparison, reason = _compare(estimate, folder / "reference.tum", alignment)
-    metrics = {
-        "trajectory": {"reason": reason, **_trajectory_metrics(estimate, comparison)},
-        "map": _map_metrics(points),
-        "resources": _resources(timeline, run_info),
-        "graph": _graph_metrics(graph),
-        "run": run_info,
-    }
-    write_json(folder / "metrics.json", metrics)
-    figures = _figures(estimate, comparison, graph, points, timeline)
-    for name, figure in figures.items():
-        plots.save(figure, folder / "plots" / f"{name}.png")
-    return metrics
+    run_info = earlier_info(folder) if run_info is None else run_info
+    evidence = read_evidence(run_files(folder), settings.alignment, settings.max_gap, run_info)
+    return write_results(folder, evidence, evaluate(evidence, settings.metrics))
 
 
-def _earlier_info(folder: Path) -> dict[str, Any]:
-    """Return section `run` of an earlier metrics.json, if there is one."""
+def run_files(folder: Path) -> EvidenceFiles:
+    """Return where the evidence of a run folder lies."""
+    reference, surface = folder / "reference.tum", folder / REFERENCE_MAP
+    if surface.is_symlink() and not surface.exists():
+        _log.warning("%s leads to a file that isn't there any more", surface)
+    return EvidenceFiles(
+        estimate=folder / "trajectory.tum",
+        reference=reference if reference.is_file() else None,
+        map=folder / "map.ply",
+        reference_map=surface if surface.is_file() else None,
+        graph=folder / "pose_graph.g2o",
+        timeline=folder / "timeline.csv",
+    )
+
+
+def earlier_info(folder: Path) -> dict[str, Any]:
+    """Return section `run` of a folder's metrics.json, empty where there is none."""
     try:
         info = json.loads((folder / "metrics.json").read_text())["run"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -81,101 +66,48 @@ def _earlier_info(folder: Path) -> dict[str, Any]:
     return info if isinstance(info, dict) else {}
 
 
-def _compare(
-    estimate: PoseTrajectory3D, path: Path, alignment: Method
-) -> tuple[TrajectoryComparison | None, str | None]:
-    """Compare to the reference, or say why that can't be done."""
-    if not path.is_file():
-        return None, "the source has no reference trajectory"
-    try:
-        return compare_trajectories(estimate, read_tum(path), alignment), None
-    except (AssociationError, AlignmentError) as error:
-        _log.warning("trajectory not compared: %s", error)
-        return None, str(error)
+def write_results(folder: Path, evidence: Evidence, verdicts: Sequence[Verdict]) -> dict[str, Any]:
+    """Write metrics.json, plots/ and report.html into a folder, and return the metrics."""
+    from eval.report.run_report import write_run_report  # takes a second, as does Matplotlib
+
+    metrics = {**to_sections(verdicts), "run": dict(evidence.run)}
+    write_json(folder / "metrics.json", metrics)
+    _write_plots(folder / "plots", evidence, verdicts)
+    write_run_report(folder / "report.html", evidence, verdicts, _config_text(folder))
+    return metrics
 
 
-def _trajectory_metrics(
-    estimate: PoseTrajectory3D, comparison: TrajectoryComparison | None
-) -> dict[str, Any]:
-    if comparison is not None:
-        return trajectory_metrics(comparison)
-    without = {
-        "path_length_m": float(estimate.path_length),
-        "poses": {"estimated": estimate.num_poses},
-    }
-    return {**dict.fromkeys(REFERENCED), **without}
+def _write_plots(folder: Path, evidence: Evidence, verdicts: Sequence[Verdict]) -> None:
+    """Write the plots of each metric under its name, and pictures of path and map."""
+    from eval import plots
+
+    figures = {}
+    for verdict in verdicts:
+        drawn = verdict.measurement.plots if verdict.measurement else ()
+        for i, plot in enumerate(drawn, 1):
+            name = verdict.metric.name if len(drawn) == 1 else f"{verdict.metric.name}_{i}"
+            figures[name] = plots.declared(plot)
+    if evidence.estimate is not None:
+        figures["trajectory"] = plots.trajectory(
+            evidence.estimate, evidence.comparison, evidence.graph
+        )
+    if evidence.map is not None:
+        figures["map"] = plots.map_from_above(evidence.map, _path_in_map(evidence))
+    for name, figure in figures.items():
+        plots.save(figure, folder / f"{name}.png")
 
 
-def _map_metrics(points: NDArray[np.float32]) -> dict[str, Any]:
-    if len(points) == 0:
-        return {"points": 0, "min_m": None, "max_m": None, "extent_m": None}
-    low, high = points.min(axis=0).astype(float), points.max(axis=0).astype(float)
-    return {
-        "points": len(points),
-        "min_m": low.tolist(),
-        "max_m": high.tolist(),
-        "extent_m": (high - low).tolist(),
-    }
+def _path_in_map(evidence: Evidence) -> NDArray[np.float64]:
+    """Return the (N, 3) estimated positions in the frame of the map, which a reference moves."""
+    if evidence.estimate is None:
+        return np.zeros((0, 3))
+    positions: NDArray[np.float64] = evidence.estimate.positions_xyz
+    if evidence.comparison is None or evidence.reference_map is None:
+        return positions
+    return evidence.comparison.alignment.move(positions)
 
 
-def _resources(timeline: Timeline, run_info: dict[str, Any]) -> dict[str, Any]:
-    """Sum up the timeline; wall time, memory and CPU of the whole run where it measured them."""
-    stages = {name: timeline[f"{name}_ms"] for name in STAGES if f"{name}_ms" in timeline}
-    total = np.sum(list(stages.values()), axis=0)
-    scans = len(timeline["stamp"])
-    wall = run_info.get("wall_seconds")
-    seconds = wall if wall else float(np.sum(total)) / 1000
-    sampled = timeline["rss_mb"].max() if scans else None
-    return {
-        "scans": scans,
-        "scans_per_s": scans / seconds if seconds > 0 else None,
-        "wall_s": wall,
-        "processing_s": float(np.sum(total)) / 1000,
-        "peak_rss_mb": run_info.get("peak_rss_mb") or sampled,
-        "cpu_percent": run_info.get("cpu_percent"),
-        "stages_ms": {name: _spread(values) for name, values in {**stages, "total": total}.items()},
-    }
-
-
-def _spread(values: NDArray[np.float64]) -> dict[str, float] | None:
-    """Return mean, percentiles, maximum and sum of (N,) values."""
-    if np.size(values) == 0:
-        return None
-    p50, p95, p99 = np.percentile(values, (50, 95, 99)).tolist()
-    return {
-        "mean": float(values.mean()),
-        "p50": p50,
-        "p95": p95,
-        "p99": p99,
-        "max": float(values.max()),
-        "sum": float(values.sum()),
-    }
-
-
-def _graph_metrics(graph: GraphSketch) -> dict[str, int]:
-    loops = int(graph.is_loop.sum())
-    return {
-        "vertices": len(graph.positions),
-        "edges": len(graph.edges),
-        "odometry_edges": len(graph.edges) - loops,
-        "loop_edges": loops,
-    }
-
-
-def _figures(
-    estimate: PoseTrajectory3D,
-    comparison: TrajectoryComparison | None,
-    graph: GraphSketch,
-    points: NDArray[np.float32],
-    timeline: Timeline,
-) -> dict[str, Figure]:
-    """Draw every figure by the name of its file."""
-    figures = {
-        "trajectory": plots.trajectory(estimate, comparison, graph),
-        "growth": plots.growth(timeline),
-        "stages": plots.stages(timeline, STAGES),
-        "map": plots.map_from_above(points, estimate.positions_xyz),
-    }
-    if comparison is not None:
-        figures["errors"] = plots.errors(comparison)
-    return figures
+def _config_text(folder: Path) -> str:
+    """Return the config that Hydra left with a run, empty where there is none."""
+    path = folder / ".hydra" / "config.yaml"
+    return path.read_text() if path.is_file() else ""

@@ -155,6 +155,20 @@ def _check_addition(name: str, lines: list[str], line: str) -> None:
     key = line.lstrip("+").partition("=")[0]
     others = [other for other in lines if not other.startswith("+")]
     config = compose(name, overrides=others, return_hydra_config=True)
-    parent = OmegaConf.select(config, key.rpartition(".")[0]) if "." in key else config
-    if not (isinstance(parent, DictConfig) and "_target_" in parent):
+    parent, grandparent = (_above(config, key, levels) for levels in (1, 2))
+    if not ("_target_" in parent or _collects(parent) or _collects(grandparent)):
         _walk(config, key)
+
+
+def _above(config: DictConfig, key: str, levels: int) -> dict[Any, Any]:
+    """Return the mapping so many levels above a dotted key, empty where there is none."""
+    above = ".".join(key.split(".")[:-levels])
+    node = OmegaConf.select(config, above) if above else None
+    plain = OmegaConf.to_container(node) if isinstance(node, DictConfig) else {}
+    return plain if isinstance(plain, dict) else {}
+
+
+def _collects(node: dict[Any, Any]) -> bool:
+    """Tell whether a mapping is a collection by name of what has a `_target_`, such as metrics."""
+    present = [child for child in node.values() if child is not None]
+    return bool(present) and all(isinstance(c, dict) and "_target_" in c for c in present)

@@ -7,6 +7,7 @@ X = `T_base_sensor` each pose becomes ``X T_map_sensor(i) X^-1`` and each map po
 
 import csv
 import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 TRAJECTORY = "trajectory.tum"
 REFERENCE = "reference.tum"
 POSE_GRAPH = "pose_graph.g2o"
+REFERENCE_MAP = "reference_map.ply"
 TIMELINE = "timeline.csv"
 _COLUMNS = (
     "stamp",
@@ -37,6 +39,8 @@ _COLUMNS = (
     "vertices",
     "edges",
     "rss_mb",
+    "child_rss_mb",
+    "cpu_percent",
 )
 _BLOCK = 1_000_000
 
@@ -72,6 +76,21 @@ def write_run(
     write_cloud_bag(folder / "map.bag", "/map", "map", stamp, points)
     write_g2o(folder / POSE_GRAPH, graph_to_base(result.graph, T_base_sensor))
     write_timeline(folder / TIMELINE, record.timeline)
+
+
+def link_reference_map(folder: Path, surface: Path | None) -> None:
+    """Have `reference_map.ply` lead to points on the true surface, or lead nowhere any more.
+
+    A relative link: such files are large, and belong to the recording.
+
+    Args:
+        folder: the run folder.
+        surface: the points, in the frame of the source's reference, or None.
+    """
+    link = folder / REFERENCE_MAP
+    link.unlink(missing_ok=True)
+    if surface is not None:
+        link.symlink_to(os.path.relpath(surface.resolve(), folder.resolve()))
 
 
 def trajectory_to_base(trajectory: Trajectory, T_base_sensor: NDArray[np.float64]) -> Trajectory:
@@ -115,7 +134,7 @@ def graph_to_base(graph: GraphSnapshot, T_base_sensor: NDArray[np.float64]) -> G
 
 
 def write_timeline(path: Path, rows: "list[TimelineRow]") -> None:
-    """Write one CSV row a scan: stamp in seconds, times of the stages in ms, graph size, memory."""
+    """Write one CSV row a scan: stamp in seconds, stages in ms, graph size, memory, CPU."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -22,9 +22,10 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from lifelong_slam.result import StageTimes
-from lifelong_slam.runner import Observer, RunRecord
-from lifelong_slam.scan import Scan
+if TYPE_CHECKING:
+    from lifelong_slam.result import StageTimes
+    from lifelong_slam.runner import Observer, RunRecord
+    from lifelong_slam.scan import Scan
 
 _log = logging.getLogger("run")
 _SECONDS_BETWEEN_LINES = 15.0
@@ -40,9 +41,9 @@ def fail(error: BaseException) -> None:
 
 
 @contextmanager
-def scan_progress(total: int) -> Iterator[Observer]:
+def scan_progress(total: int) -> Iterator["Observer"]:
     """Yield an observer that shows a bar on a terminal, and now and then a line elsewhere."""
-    if not sys.stderr.isatty():
+    if not Console(stderr=True).is_interactive:
         yield _Lines(total)
         return
     columns = (TextColumn("Mapping"), BarColumn(), MofNCompleteColumn(), _Rate())
@@ -58,7 +59,7 @@ class _Bar:
         self._bar = bar
         self._task = bar.add_task("", total=total)
 
-    def update(self, scan: Scan, times: StageTimes) -> None:
+    def update(self, scan: "Scan", times: "StageTimes") -> None:
         """Count one scan."""
         self._bar.advance(self._task)
 
@@ -75,7 +76,7 @@ class _Lines:
         self._done = 0
         self._start = self._last = time.monotonic()
 
-    def update(self, scan: Scan, times: StageTimes) -> None:
+    def update(self, scan: "Scan", times: "StageTimes") -> None:
         """Count one scan, and log a line when the last one is a while ago."""
         self._done += 1
         now = time.monotonic()
@@ -102,7 +103,7 @@ def _logging_above(bar: Progress) -> Iterator[None]:
                 handler.setStream(stream)
 
 
-def show_results(record: RunRecord, metrics: dict[str, Any], folder: Path) -> None:
+def show_results(record: "RunRecord", metrics: dict[str, Any], folder: Path) -> None:
     """Print a short table of what came out, and where it is."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in _rows(record, metrics):
@@ -111,21 +112,27 @@ def show_results(record: RunRecord, metrics: dict[str, Any], folder: Path) -> No
     print(f"Run folder: {folder}")
 
 
-def _rows(record: RunRecord, metrics: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    trajectory = metrics["trajectory"]
+def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield a line for each figure that there is; the config may have left metrics out."""
+    trajectory, points, graph = metrics["trajectory"], metrics["map"], metrics["graph"]
     scans, rate = len(record.timeline), record.scans_per_second
     yield "Scans", f"{scans} in {record.wall_seconds:.1f} s ({rate:.1f} scans/s)"
-    yield "Path", f"{trajectory['path_length_m']:.1f} m"
-    if trajectory["mae_m"] is None:
-        yield "Trajectory error", str(trajectory["reason"])
-    else:
+    if "path_length_m" in trajectory:
+        yield "Path", f"{trajectory['path_length_m']:.1f} m"
+    if trajectory.get("mae_m") is not None:
         yield (
             "Trajectory error",
             f"MAE {trajectory['mae_m']:.3f} m, RMSE {trajectory['rmse_m']:.3f} m,"
-            f" max {trajectory['max_m']:.3f} m (Kabsch-aligned)",
+            f" max {trajectory['max_m']:.3f} m (after alignment)",
         )
-    graph = metrics["graph"]
-    loops = graph["loop_edges"]
-    yield "Pose graph", f"{graph['vertices']} vertices, {graph['edges']} edges, {loops} loops"
-    yield "Map", f"{metrics['map']['points']:,} points"
+    elif "position_error" in trajectory["reasons"]:
+        yield "Trajectory error", trajectory["reasons"]["position_error"]
+    if "vertices" in graph:
+        loops = graph["loop_edges"]
+        yield "Pose graph", f"{graph['vertices']} vertices, {graph['edges']} edges, {loops} loops"
+    if "points" in points:
+        yield "Map", f"{points['points']:,} points"
+    if points.get("mean_distance_m") is not None:
+        mean = points["mean_distance_m"]["map_to_reference"]
+        yield "Map error", f"{mean:.3f} m mean distance from the true surface"
     yield "Peak memory", f"{record.peak_rss_mb:.0f} MB"

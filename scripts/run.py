@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -22,16 +22,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 from console import fail, scan_progress, show_results
 from eval.errors import EvalError
+from eval.evaluation import make_settings
 from eval.run import evaluate_run
 from lifelong_slam.config import build, check_value
 from lifelong_slam.errors import ConfigError, LifelongSlamError
 from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.overrides import check_overrides
 from lifelong_slam.provenance import describe_run, seed_everything
-from lifelong_slam.run_folder import write_run
+from lifelong_slam.run_folder import link_reference_map, write_run
 from lifelong_slam.runner import RunRecord, ViewerObserver, run, stop_on_signals
 from lifelong_slam.slam import LifelongSlam
-from lifelong_slam.sources.source import Source
+from lifelong_slam.sources.source import Source, Surveyed
 from lifelong_slam.systems.system import System
 from lifelong_slam.viewer import StubViewer
 
@@ -65,7 +66,8 @@ def slam(config: DictConfig, folder: Path) -> RunRecord:
     """Run SLAM, write and evaluate the run folder, show the results."""
     with stop_on_signals() as stop:
         seed_everything(check_value("seed", config.seed, int))
-        system = build(part(config, "system"))  # first, since recording a scenario takes a while
+        settings = make_settings(plain(part(config, "eval")))
+        system = build(part(config, "system"))  # before recording a scenario, which takes a while
         source = build(part(config, "scenario"))
         viewer = build(part(config, "viewer"))
         observers = [] if isinstance(viewer, StubViewer) else [ViewerObserver(viewer, system)]
@@ -75,7 +77,8 @@ def slam(config: DictConfig, folder: Path) -> RunRecord:
         finally:
             viewer.close()
         write_run(folder, record, source.reference(), source.T_base_sensor)
-        metrics = evaluate_run(folder, run_info(config.seed, record))
+        link_reference_map(folder, source.surface_path if isinstance(source, Surveyed) else None)
+        metrics = evaluate_run(folder, settings, run_info(config.seed, record))
         show_results(record, metrics, folder)
     return record
 
@@ -86,6 +89,11 @@ def part(config: DictConfig, group: str) -> DictConfig:
     if not isinstance(node, DictConfig):
         raise ConfigError(f"nothing is chosen for {group}: give {group}=...")
     return node
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Return a config as dictionaries, lists and values."""
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
 
 
 @contextmanager
@@ -122,6 +130,7 @@ def run_info(seed: int, record: RunRecord) -> dict[str, Any]:
         "wall_seconds": record.wall_seconds,
         "scans_per_second": record.scans_per_second,
         "peak_rss_mb": record.peak_rss_mb,
+        "mean_rss_mb": record.mean_rss_mb,
         "cpu_percent": record.cpu_percent,
         "input": record.counts,
         "system": record.result.counts,
@@ -146,11 +155,20 @@ def check_command_line() -> None:
         check_overrides(Path(CONF), arguments.overrides, arguments.config_name or "config", more)
 
 
+def prepare_launcher() -> None:
+    """Have the processes of a launcher find the modules beside this one, and draw no bars."""
+    if any(argument.startswith("hydra/launcher=") for argument in sys.argv[1:]):
+        paths = [str(Path(__file__).resolve().parent), os.environ.get("PYTHONPATH")]
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+        os.environ["TERM"] = "dumb"
+
+
 def main() -> int:
     """Run one job or a sweep, and turn whatever went wrong into one line and an exit status."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # have Hydra raise errors instead of printing them
     try:
         check_command_line()
+        prepare_launcher()
         job()
     except OSError as error:
         fail(ConfigError(f"can't make the run folder: {error}; choose one with hydra.run.dir=F"))

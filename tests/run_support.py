@@ -1,11 +1,13 @@
 """What the tests of runs share: a room seen from a moving sensor, as scans, files and sources."""
 
 import signal
+from pathlib import Path
 
 import numpy as np
 
 from lifelong_slam.geometry import exp, invert, transform
 from lifelong_slam.scan import Scan
+from lifelong_slam.trajectory import Trajectory
 
 PERIOD = 100_000_000
 START = 1_700_000_000_000_000_000
@@ -97,3 +99,16 @@ class SignallingSource(ListSource):
             if i in self.at:
                 signal.raise_signal(self.number)
             yield scan
+
+
+class SurveyedSource(ListSource):
+    """Knows the room that its scans see, and the path through it."""
+
+    def __init__(self, count: int, surface: str):
+        super().__init__(scans(count))
+        self.surface_path = Path(surface)
+        stamps = np.array([scan.stamp for scan in self.scans])
+        self.path = Trajectory(stamps, arc(count))
+
+    def reference(self):
+        return self.path

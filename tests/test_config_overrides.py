@@ -42,6 +42,8 @@ def test_accepts(overrides):
         ("hydra/launcher=joblob", "Choices: basic"),
         ("+foo=1", "no setting 'foo'"),
         ("+sensor.max_rnge=3", "Did you mean 'max_range'"),
+        ("+eval.metrcs.mine._target_=a.B", "Did you mean 'metrics'"),
+        ("+system.odometry.motion.x.y=1", "no setting"),
         ("scenario/x=3", "no setting 'scenario/x'"),
         ("a=b=c", "'a=b=c' can't be read"),
         ("E", "'E' can't be read: write key=value"),
@@ -51,6 +53,19 @@ def test_refuses_in_one_line_that_names_what_is_right(overrides, message):
     with pytest.raises(ConfigError, match=message) as caught:
         check_overrides(CONF, [SYSTEM, *overrides.split()])
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        "+eval.metrics.mine._target_=my_package.Metric",
+        "+eval.metrics.mine._target_=my_package.Metric +eval.metrics.mine.delta=3",
+        "+eval.metrics.mine={_target_:my_package.Metric}",
+        "+eval.metrics.mine._target_=my_package.Metric eval.metrics.speed=null",
+    ],
+)
+def test_collections_of_targets_take_more_of_them(overrides):
+    check_overrides(CONF, [SYSTEM, *overrides.split()])
 
 
 def test_a_second_folder_of_configs_adds_choices(tmp_path):

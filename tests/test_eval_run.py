@@ -5,18 +5,23 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib import get_cachedir
 from matplotlib.image import imread
+from settings_support import default_settings
 
 from eval.errors import FileError
-from eval.files import read_graph, read_points, read_timeline, write_json
+from eval.files import read_graph, read_timeline, write_json
+from eval.map_files import read_map
 from eval.map_image import rasterise
 from eval.run import evaluate_run
 
-PLOTS = {"trajectory.png", "errors.png", "growth.png", "stages.png", "map.png"}
+EVALUATE = str(Path(__file__).parents[1] / "scripts" / "evaluate.py")
+PICTURES = {"trajectory.png", "map.png"}
+SETTINGS = default_settings()
 GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
 VERTEX_SE3:QUAT 1 10 0 0 0 0 0 1
 VERTEX_SE3:QUAT 5 20 0 0 0 0 0 1
@@ -47,19 +52,21 @@ def write_folder(folder, count=120):
     return folder
 
 
-def write_map(folder, points):
+def write_map(folder, points, name="map.ply"):
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(points)}\n"
         "property float x\nproperty float y\nproperty float z\nend_header\n"
     )
-    (folder / "map.ply").write_bytes(header.encode() + points.astype("<f4").tobytes())
+    (folder / name).write_bytes(header.encode() + points.astype("<f4").tobytes())
 
 
 @pytest.fixture(scope="module")
 def judged(tmp_path_factory):
     folder = write_folder(tmp_path_factory.mktemp("run"))
-    return folder, evaluate_run(folder, {"wall_seconds": 4.0, "peak_rss_mb": 999.0, "seed": 3})
+    return folder, evaluate_run(
+        folder, SETTINGS, {"wall_seconds": 4.0, "peak_rss_mb": 999.0, "seed": 3}
+    )
 
 
 def test_metrics_have_every_section(judged):
@@ -69,9 +76,10 @@ def test_metrics_have_every_section(judged):
     assert metrics["trajectory"]["mae_m"] == pytest.approx(0.05, abs=1e-3)
     assert metrics["trajectory"]["coverage"] == pytest.approx(1)
     assert metrics["trajectory"]["poses"]["matched"] == 120
-    assert metrics["trajectory"]["reason"] is None
+    assert not {"position_error", "path_length"} & metrics["trajectory"]["reasons"].keys()
     assert metrics["map"]["points"] == 5000
-    assert metrics["graph"] == {"vertices": 3, "edges": 3, "odometry_edges": 2, "loop_edges": 1}
+    counts = {"vertices": 3, "edges": 3, "odometry_edges": 2, "loop_edges": 1}
+    assert metrics["graph"] == {**counts, "reasons": {}, "warnings": []}
     assert metrics["run"]["seed"] == 3
 
 
@@ -87,9 +95,11 @@ def test_resources_sum_up_the_timeline(judged):
 
 def test_every_plot_is_a_picture(judged):
     folder, _ = judged
-    assert {path.name for path in (folder / "plots").iterdir()} == PLOTS
-    for name in PLOTS:
-        image = imread(folder / "plots" / name)
+    plots = sorted((folder / "plots").iterdir())
+    assert {path.name for path in plots} > PICTURES | {"graph_size.png", "stage_times.png"}
+    assert any(path.name.startswith("position_error") for path in plots)
+    for path in plots:
+        image = imread(path)
         assert image.shape[1] > 800
         assert np.ptp(image[..., :3]) > 0.5
 
@@ -101,28 +111,49 @@ def test_nothing_temporary_is_left(judged):
 def test_without_reference_the_rest_is_still_there(tmp_path):
     folder = write_folder(tmp_path)
     (folder / "reference.tum").unlink()
-    metrics = evaluate_run(folder, {})
+    metrics = evaluate_run(folder, SETTINGS, {})
     assert metrics["trajectory"]["mae_m"] is None
-    assert metrics["trajectory"]["reason"] == "the source has no reference trajectory"
+    assert metrics["trajectory"]["reasons"]["position_error"] == "there is no reference trajectory"
     assert metrics["trajectory"]["path_length_m"] > 119
     assert metrics["resources"]["scans_per_s"] == pytest.approx(40)
     assert metrics["resources"]["peak_rss_mb"] == 419
-    assert {path.name for path in (folder / "plots").iterdir()} == PLOTS - {"errors.png"}
+    plots = {path.name for path in (folder / "plots").iterdir()}
+    assert plots > PICTURES
+    assert not {name for name in plots if name.startswith("position_error")}
 
 
 def test_a_reference_of_another_day_is_a_reason(tmp_path):
     folder = write_folder(tmp_path)
     text = (folder / "reference.tum").read_text()
     (folder / "reference.tum").write_text(text.replace("17000000", "16000000"))
-    metrics = evaluate_run(folder, {})
+    metrics = evaluate_run(folder, SETTINGS, {})
     assert metrics["trajectory"]["rmse_m"] is None
-    assert "lie within the reference's time" in metrics["trajectory"]["reason"]
+    assert "lie within the reference's time" in metrics["trajectory"]["reasons"]["position_error"]
+
+
+def test_a_surface_in_the_run_folder_judges_the_map(tmp_path):
+    folder = write_folder(tmp_path)
+    write_map(folder, np.random.default_rng(2).normal(size=(4000, 3)), "reference_map.ply")
+    metrics = evaluate_run(folder, SETTINGS, {})
+    judged = {key for key, value in metrics["map"].items() if value is not None}
+    (folder / "reference_map.ply").unlink()
+    without = evaluate_run(folder, SETTINGS, {})
+    assert judged > {key for key, value in without["map"].items() if value is not None}
+    assert str(tmp_path) not in json.dumps(metrics)
+
+
+def test_a_surface_that_is_gone_is_said(tmp_path, caplog):
+    folder = write_folder(tmp_path)
+    (folder / "reference_map.ply").symlink_to("gone.ply")
+    metrics = evaluate_run(folder, SETTINGS, {})
+    assert "reference_map.ply leads to a file that isn't there" in caplog.text
+    assert metrics["map"]["points"] == 5000
 
 
 def test_judging_again_keeps_what_is_known_of_the_run(tmp_path):
     folder = write_folder(tmp_path)
-    evaluate_run(folder, {"seed": 7, "wall_seconds": 2.0})
-    again = evaluate_run(folder)
+    evaluate_run(folder, SETTINGS, {"seed": 7, "wall_seconds": 2.0})
+    again = evaluate_run(folder, SETTINGS)
     assert again["run"] == {"seed": 7, "wall_seconds": 2.0}
     assert again["resources"]["scans_per_s"] == pytest.approx(60)
 
@@ -131,7 +162,7 @@ def test_an_empty_map_and_graph_and_one_scan(tmp_path):
     folder = write_folder(tmp_path, count=1)
     write_map(folder, np.zeros((0, 3)))
     (folder / "pose_graph.g2o").write_text("")
-    metrics = evaluate_run(folder, {})
+    metrics = evaluate_run(folder, SETTINGS, {})
     assert metrics["map"]["points"] == 0
     assert metrics["graph"]["vertices"] == 0
     assert metrics["trajectory"]["mae_m"] is None
@@ -141,7 +172,7 @@ def test_a_timeline_without_rows(tmp_path):
     folder = write_folder(tmp_path)
     header = (folder / "timeline.csv").read_text().splitlines()[0]
     (folder / "timeline.csv").write_text(header + "\n")
-    resources = evaluate_run(folder, {})["resources"]
+    resources = evaluate_run(folder, SETTINGS, {})["resources"]
     assert (resources["scans"], resources["scans_per_s"]) == (0, None)
     assert resources["stages_ms"]["odometry"] is None
 
@@ -151,10 +182,10 @@ def test_missing_and_broken_files_are_named(tmp_path, name):
     folder = write_folder(tmp_path)
     (folder / name).write_text("VERTEX_SE3:QUAT nonsense\n1,2\nx\n")
     with pytest.raises(FileError, match=name):
-        evaluate_run(folder)
+        evaluate_run(folder, SETTINGS)
     (folder / name).unlink()
     with pytest.raises(FileError, match=name):
-        evaluate_run(folder)
+        evaluate_run(folder, SETTINGS)
     assert not (folder / "metrics.json").exists()
 
 
@@ -189,7 +220,7 @@ def test_points_and_timeline_are_read_as_they_were_written(tmp_path):
     folder = write_folder(tmp_path)
     points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
     write_map(folder, points)
-    np.testing.assert_array_equal(read_points(folder / "map.ply"), points)
+    np.testing.assert_array_equal(read_map(folder / "map.ply"), points)
     assert read_timeline(folder / "timeline.csv")["rss_mb"][-1] == 419
 
 
@@ -208,17 +239,20 @@ def test_evaluation_neither_needs_nor_touches_the_home_folder(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     write_folder(folder)
-    program = "import sys, pathlib, eval.run as r; r.evaluate_run(pathlib.Path(sys.argv[1]))"
+    command = [sys.executable, EVALUATE, f"run={folder}"]
     settings = {**os.environ, "HOME": str(home), "MPLCONFIGDIR": get_cachedir()}
-    subprocess.run([sys.executable, "-c", program, folder], env=settings, check=True)
+    subprocess.run(command, env=settings, check=True, capture_output=True)
     assert not (home / ".evo").exists()
     assert (folder / "metrics.json").is_file()
     shutil.rmtree(home)
-    subprocess.run([sys.executable, "-c", program, folder], env=settings, check=True)
+    subprocess.run(command, env=settings, check=True, capture_output=True)
 
 
 def test_eval_knows_nothing_of_the_slam_system():
-    program = "import sys, eval.run; print('lifelong_slam' in sys.modules)"
+    program = (
+        "import sys, eval.run, eval.plots, eval.testing, eval.report.run_report\n"
+        "print('lifelong_slam' in sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )

@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_support import write_folder
+from run_support import room, write_folder
 
 import run
+from lifelong_slam.io.ply import write_ply
 from lifelong_slam.trajectory import read_tum
 
 ROOT = Path(__file__).parent.parent
 SYSTEM = ["system=kiss_icp", "sensor=solid_state"]
 FILES = {"trajectory.tum", "trajectory.bag", "map.ply", "map.bag", "pose_graph.g2o"} | {
     "metrics.json",
+    "report.html",
     "timeline.csv",
     "plots",
     ".hydra",
@@ -142,6 +144,30 @@ def test_help_lists_groups_and_examples(cli):
     assert status == 0
     for words in ("scenario: A, B, C", "sensor: bosch", "python scripts/run.py", "Exit status"):
         assert words in out
+
+
+def test_a_source_that_knows_the_place_has_its_map_judged(cli, tmp_path):
+    (tmp_path / "conf" / "scenario").mkdir(parents=True)
+    text = "_target_: run_support.SurveyedSource\ncount: 20\nsurface: room.ply\n"
+    (tmp_path / "conf" / "scenario" / "room.yaml").write_text(text)
+    write_ply(tmp_path / "room.ply", room().astype(np.float32))
+    status, out, _ = cli("--config-dir", "conf", *SYSTEM, "scenario=room", "hydra.run.dir=run")
+    assert status == 0
+    assert "mean distance from the true surface" in out
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    assert metrics["trajectory"]["max_m"] < 0.2
+    assert 0 < metrics["map"]["mean_distance_m"]["map_to_reference"] < 0.3
+    assert metrics["resources"]["mean_rss_mb"] > 10
+    assert str(tmp_path) not in json.dumps(metrics)
+
+
+def test_a_metric_that_cannot_be_made_ends_the_run_before_it_begins(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 2)
+    wrong = "eval.metrics.speed._target_=nowhere.Speed"
+    status, out, err = cli(*SYSTEM, "scenario=folder", f"scenario.path={scans}", wrong)
+    assert (status, out) == (2, "")
+    assert "nowhere.Speed can't be loaded" in err
+    assert {path.name for path in tmp_path.iterdir()} == {"scans"}
 
 
 SIGNALLING = """

@@ -18,7 +18,13 @@ from lifelong_slam.io.bags import write_pose_bag
 from lifelong_slam.io.g2o import read_g2o
 from lifelong_slam.io.ply import write_ply
 from lifelong_slam.result import GraphSnapshot, SlamResult
-from lifelong_slam.run_folder import graph_to_base, points_to_base, trajectory_to_base, write_run
+from lifelong_slam.run_folder import (
+    graph_to_base,
+    link_reference_map,
+    points_to_base,
+    trajectory_to_base,
+    write_run,
+)
 from lifelong_slam.runner import RunRecord, TimelineRow
 from lifelong_slam.trajectory import Trajectory, read_tum
 
@@ -32,7 +38,7 @@ def some_record(count=60, points=1000):
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 100_000_000
     cloud = rng.normal(size=(points, 3)).astype(np.float32) * 20
     result = SlamResult(Trajectory(stamps, poses), cloud, some_graph(rng))
-    timeline = [TimelineRow(int(s), 20.5, 1.25, 0.0, 0.0, 3, 2, 512.0) for s in stamps]
+    timeline = [TimelineRow(int(s), 20.5, 1.25, 0.0, 0.0, 3, 2, 512.0, 64.0, 150.0) for s in stamps]
     return RunRecord(result, timeline, {}, 2.0, 600.0, False)
 
 
@@ -180,8 +186,10 @@ def test_graph_is_the_bases(run):
 def test_timeline_has_one_row_a_scan(run):
     folder, record, _ = run
     header, first, *rest = (folder / "timeline.csv").read_text().splitlines()
-    assert header == "stamp,odometry_ms,loop_ms,optimise_ms,prune_ms,vertices,edges,rss_mb"
-    assert first == "1700000000.123456789,20.500,1.250,0.000,0.000,3,2,512.000"
+    assert header == (
+        "stamp,odometry_ms,loop_ms,optimise_ms,prune_ms,vertices,edges,rss_mb,child_rss_mb,cpu_percent"
+    )
+    assert first == "1700000000.123456789,20.500,1.250,0.000,0.000,3,2,512.000,64.000,150.000"
     assert len(rest) == len(record.timeline) - 1
 
 
@@ -192,6 +200,22 @@ def test_without_reference_an_old_one_does_not_stay(tmp_path):
     assert not (tmp_path / "reference.tum").exists()
     with Reader(tmp_path / "trajectory.bag") as bag:
         assert set(bag.topics) == {"/trajectory/base/pose"}
+
+
+def test_the_reference_map_is_a_link_that_goes_where_the_run_folder_goes(tmp_path):
+    surface, folder = tmp_path / "cache" / "surface.ply", tmp_path / "outputs" / "run"
+    for path in (surface.parent, folder):
+        path.mkdir(parents=True)
+    surface.write_text("points")
+    link_reference_map(folder, surface)
+    link_reference_map(folder, surface)
+    link = folder / "reference_map.ply"
+    assert link.is_symlink()
+    assert not link.readlink().is_absolute()
+    assert link.read_text() == "points"
+    link_reference_map(folder, None)
+    assert not link.is_symlink()
+    assert surface.exists()
 
 
 def test_a_run_of_one_scan_without_map_or_graph_is_written(tmp_path):

@@ -1,7 +1,8 @@
 """The protocol of a source of scans."""
 
 from collections.abc import Iterator
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,4 +39,14 @@ class Source(Protocol):
     @property
     def T_base_sensor(self) -> NDArray[np.float64]:
         """(4, 4) pose of the sensor on the vehicle; the identity where nothing is known."""
+        ...
+
+
+@runtime_checkable
+class Surveyed(Protocol):
+    """A source that knows the place itself, for evaluation only."""
+
+    @property
+    def surface_path(self) -> Path:
+        """File of points on the true static surface, in the frame of the reference."""
         ...
