@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import t
 
 from eval.alignment import kabsch
+from eval.statistics import spread
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,6 @@ LAW = (
     " was measured (an optimisation takes time in proportion to the vertices, which grow with the hours h)."
     " Its graph goes on growing and is optimised at the samples, where error and memory are measured."
 )
-_CONFIDENCE = 0.95
 _EARLY = 0.2  # share of the run at which the graph should have its final size
 
 
@@ -94,19 +93,6 @@ def extrapolate(hours: Array, seconds: Array) -> Array:
     powers = np.column_stack([hours, hours**2])
     coefficients, _ = nnls(powers[measured], seconds[measured])
     return np.where(measured, seconds, powers @ coefficients)
-
-
-def spread(values: Sequence[float]) -> dict[str, Any]:
-    """Return mean, standard deviation and 95 % confidence interval of the mean (Student's t).
-
-    The last two are None for a single value.
-    """
-    mean, n = float(np.mean(values)), len(values)
-    if n == 1:
-        return {"mean": mean, "std": None, "ci95": None, "values": [*values]}
-    deviation = float(np.std(values, ddof=1))
-    half = float(t.ppf((1 + _CONFIDENCE) / 2, n - 1)) * deviation / np.sqrt(n)
-    return {"mean": mean, "std": deviation, "ci95": [mean - half, mean + half], "values": [*values]}
 
 
 def summarise(runs: Sequence[Run]) -> list[dict[str, Any]]:

@@ -11,10 +11,10 @@ from eval.ablation import (
     map_error,
     position_rmse,
     rows,
-    spread,
     summarise,
 )
 from eval.ablation_plots import PANELS, overview, save, single
+from eval.statistics import spread
 
 HOURS = np.array([0.5, 1.0, 1.5, 2.0, 2.5])
 RNG = np.random.default_rng(0)

@@ -1,0 +1,107 @@
+"""Put the figures of runs side by side, and beside the published ones.
+
+    python scripts/run.py -m scenario=A,B,C,D,E,F sensor=bosch,velodyne
+    python scripts/compare.py runs=multirun/2026-01-31/12-00-00
+    python scripts/compare.py runs=[outputs/first,multirun/2026-01-31] out=report
+
+Every run folder in and below the named folders is taken in. Settings:
+
+    runs=DIR             a run folder, a multirun folder, or any folder above such; several as [DIR,DIR]
+    out=DIR              where the results go; default: `comparison` in the first of the folders
+
+Tables: the trajectory errors of each scenario and sensor (Tables 5.1 and 5.2 of the published campaigns),
+the distances between the maps of its two sensors in both directions (Table 5.3; runs that differ in the
+sensor alone make a pair), and all headline figures by the settings in which the runs differ. Runs that
+differ in their seeds alone (seed=, scenario.seed=) give mean and 95 % confidence interval. Runs that
+failed, were stopped early or were repeated later are named, not compared.
+
+Files in `out`: comparison.md, comparison.tex (booktabs, multirow), a CSV file for each table, report.html.
+The tables are printed as well.
+
+Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
+"""
+
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from console import fail
+from eval.comparison.report import write_report
+from eval.comparison.runs import find_runs
+from eval.comparison.tables import make_tables
+from eval.comparison.writing import markdown, write_tables
+from eval.errors import EvalError
+from lifelong_slam.config import check_value
+from lifelong_slam.errors import ConfigError, LifelongSlamError, did_you_mean
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the command line can say; see the top of this file."""
+
+    runs: list[Path]
+    out: Path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare runs and return the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(__doc__)
+        return 0
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    try:
+        compare(parse(arguments))
+    except (LifelongSlamError, EvalError, OSError) as error:
+        fail(error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("Stopped: nothing is written.", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> Settings:
+    """Return the checked settings.
+
+    Raises:
+        ConfigError: an argument is no setting, no runs are named, or a value has the wrong type.
+    """
+    known = [*Settings.__annotations__]
+    try:
+        given = OmegaConf.to_container(OmegaConf.from_dotlist([*arguments]))
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise ConfigError(f"can't read the settings: {' '.join(str(error).split())}") from error
+    assert isinstance(given, dict)
+    for key in map(str, given):
+        if key not in known:
+            raise ConfigError(f"there is no setting '{key}'.{did_you_mean(key, known)} See --help")
+    if not given.get("runs"):
+        raise ConfigError("no runs are named: give runs=DIR; see --help")
+    named = given["runs"] if isinstance(given["runs"], list) else [given["runs"]]
+    runs = [Path(check_value("runs", folder, str)) for folder in named]
+    return Settings(
+        runs, Path(check_value("out", given.get("out", str(runs[0] / "comparison")), str))
+    )
+
+
+def compare(settings: Settings) -> None:
+    """Read the runs, write tables and report, print the tables."""
+    runs = find_runs(settings.runs)
+    tables = make_tables(runs.finished)
+    write_tables(settings.out, tables, runs.missing)
+    write_report(settings.out / "report.html", runs, tables)
+    print(markdown(tables, runs.missing))
+    print(f"Written to: {settings.out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
