@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Method = Literal["none", "first_pose", "se3", "yaw", "sim3"]
 
 _LINE = 0.01  # spread across a line, relative to the spread along it
+_ROLL = 0.02  # rad; an alignment that may be off by more is worth a warning
 _FAR = 1000.0  # metres
 _STILL = 1e-6  # metres
 
@@ -170,10 +171,11 @@ def _warnings(found: Alignment, source: Array, target: Array) -> list[str]:
             f"errors ({rmse:.1f} m RMSE) are as large as the path (standard deviation {spread[0]:.1f} m):"
             " the alignment's rotation is not determined"
         )
-    elif axes == 3 and spread[1] <= max(_LINE * spread[0], rmse):
+    elif axes == 3 and spread[1] <= max(_LINE * spread[0], rmse / _ROLL):
+        open_by = np.degrees(np.arctan2(rmse, spread[1]))
         warnings.append(
             f"the path is nearly a straight line (standard deviations: {spread[0]:.1f} m along,"
-            f" {spread[1]:.2f} m across): roll about it is not determined by the alignment, so"
-            " absolute rotation errors mean little"
+            f" {spread[1]:.2f} m across; errors of {rmse:.3f} m): the alignment leaves roll about it"
+            f" open by some {open_by:.1f} deg, so absolute rotation errors mean little"
         )
     return warnings

@@ -149,9 +149,10 @@ def show(verdicts: Sequence[Verdict], evidence: Evidence) -> None:
             )
     console = Console()
     console.print(table)
+    warnings = [w for v in verdicts if v.measurement for w in v.measurement.warnings]
+    for warning in dict.fromkeys(warnings):
+        console.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)
     for verdict in verdicts:
-        for warning in verdict.measurement.warnings if verdict.measurement else ():
-            console.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)
         refused = all(getattr(evidence, need) is not None for need in verdict.metric.needs)
         if verdict.reason and refused:
             line = f"no {verdict.metric.name}: {verdict.reason}"
