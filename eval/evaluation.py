@@ -79,7 +79,7 @@ def to_sections(verdicts: Sequence[Verdict]) -> dict[str, dict[str, Any]]:
     """Return the sections of metrics.json, all of them, whatever was measured.
 
     Each has the values of its metrics by their keys (null where there is no measurement), `reasons`
-    by metric for those, and `warnings`.
+    by metric for those, `warnings`, and `headlines` by metric, for those who compare runs.
 
     Raises:
         MetricError: two metrics of a section share a key.
@@ -92,6 +92,7 @@ def to_sections(verdicts: Sequence[Verdict]) -> dict[str, dict[str, Any]]:
             **_merged(chosen),
             "reasons": {v.metric.name: v.reason for v in chosen if v.reason is not None},
             "warnings": list(dict.fromkeys(text for answer in answers for text in answer.warnings)),
+            "headlines": {v.metric.name: _headline(v) for v in chosen},
         }
     return sections
 
@@ -127,6 +128,16 @@ def _lack(evidence: Evidence, metric: Metric) -> str | None:
 
 def _missing(field: Any) -> bool:
     return field is None or (isinstance(field, Mapping) and not field)
+
+
+def _headline(verdict: Verdict) -> dict[str, Any]:
+    metric, measurement = verdict.metric, verdict.measurement
+    return {
+        "title": metric.title,
+        "value": None if measurement is None else measurement.headline,
+        "unit": metric.unit,
+        "less_is_better": metric.less_is_better,
+    }
 
 
 def _merged(verdicts: Sequence[Verdict]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ def find_metrics(configs: Iterable[Mapping[str, Any]]) -> tuple[Metric, ...]:
         configs: a `_target_` and settings each.
 
     Raises:
-        MetricError: a metric can't be imported or made, is no metric, or two have one name.
+        MetricError: a metric can't be imported or made, is no metric, or two have one name or title.
     """
     metrics = [make_metric(config) for config in configs]
     named = [type(metric) for metric in metrics]
@@ -33,9 +33,8 @@ def find_metrics(configs: Iterable[Mapping[str, Any]]) -> tuple[Metric, ...]:
         plugin = _load(entry)
         if not any(plugin is known for known in named):
             metrics.append(_make(plugin, {}, f"metric {entry.name} of {entry.value}"))
-    names = [metric.name for metric in metrics]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise MetricError(f"more than one metric is called {', '.join(twice)}")
+    _check_unique([metric.name for metric in metrics])
+    _check_unique([metric.title for metric in metrics])
     return tuple(metrics)
 
 
@@ -70,6 +69,11 @@ def check_value(where: str, value: Any, annotation: Any) -> Any:
         return value
     except ValidationError as error:
         raise MetricError(f"{where}: {error.errors()[0]['msg']}, got {value!r}") from error
+
+
+def _check_unique(names: list[str]) -> None:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise MetricError(f"more than one metric is called {', '.join(twice)}")
 
 
 def _load(entry: EntryPoint) -> Any:

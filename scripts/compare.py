@@ -11,8 +11,8 @@ Every run folder in and below the named folders is taken in. Settings:
 
 Tables: the trajectory errors of each scenario and sensor (Tables 5.1 and 5.2 of the published campaigns),
 the distances between the maps of its two sensors in both directions (Table 5.3; runs that differ in the
-sensor alone make a pair), and all headline figures by the settings in which the runs differ. Runs that
-differ in their seeds alone (seed=, scenario.seed=) give mean and 95 % confidence interval. Runs that
+sensor alone make a pair), and the headlines of all metrics by the settings in which the runs differ. Runs
+that differ in their seeds alone (seed=, scenario.seed=) give mean and 95 % confidence interval. Runs that
 failed, were stopped early or were repeated later are named, not compared.
 
 Files in `out`: comparison.md, comparison.tex (booktabs, multirow), a CSV file for each table, report.html.

@@ -50,6 +50,7 @@ from eval.errors import EvalError
 from eval.evaluation import Verdict, evaluate, make_settings
 from eval.evidence import Evidence
 from eval.evidence_files import EvidenceFiles, read_evidence
+from eval.numbers import number
 from eval.run import earlier_info, run_files, write_results
 from lifelong_slam.config import check_value
 from lifelong_slam.errors import ConfigError, LifelongSlamError
@@ -157,11 +158,6 @@ def show(verdicts: Sequence[Verdict], evidence: Evidence) -> None:
         if verdict.reason and refused:
             line = f"no {verdict.metric.name}: {verdict.reason}"
             console.print(line, style="dim", soft_wrap=True, markup=False)
-
-
-def number(value: float) -> str:
-    """Write a figure with four digits, or all of those before the point."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 _BETTER = {True: "less", False: "more", None: ""}

@@ -44,6 +44,13 @@ def errors(mae, largest=None, alignment=None):
     }
 
 
+def headlined(section, **headlines):
+    """Return a section with headlines by metric: title, value, unit, and whether less is better."""
+    names = ("title", "value", "unit", "less_is_better")
+    found = {name: dict(zip(names, told, strict=True)) for name, told in headlines.items()}
+    return {**section, "headlines": found}
+
+
 def aligned(method, rotation=IDENTITY, shift=(0.0, 0.0, 0.0), scale=1.0):
     """Return an alignment as metrics.json holds it."""
     return {

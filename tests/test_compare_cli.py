@@ -7,6 +7,7 @@ import pytest
 from comparison_support import aligned, errors, write_map, write_run, write_trajectories
 
 import compare
+import evaluate
 from eval.trajectory_files import read_tum
 
 PATH = [[0, 0, 0], [10, 0, 0], [10, 8, 1], [0, 9, 0.0]]
@@ -60,6 +61,21 @@ def test_a_run_without_reference_is_drawn_where_it_is(tmp_path):
     assert len(read_tum(folder / "trajectory.tum").timestamps) == len(PATH)
     assert compare.main([f"runs={tmp_path}"]) == 0
     assert "Trajectories: scenario bag" in (tmp_path / "comparison" / "report.html").read_text()
+
+
+def test_folders_of_evaluate_are_compared_by_their_names(sweep, capsys):
+    for folder in sorted(sweep.glob("[01]_*")):
+        estimate, reference = (folder / f"{name}.tum" for name in ("trajectory", "reference"))
+        out = sweep / "judged" / folder.name.partition("_")[2]
+        files = [
+            f"{key}={path}" for key, path in (("estimate", estimate), ("reference", reference))
+        ]
+        assert evaluate.main([*files, f"out={out}"]) == 0
+    capsys.readouterr()
+    assert compare.main([f"runs={sweep / 'judged'}"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"^\| bosch .*\n\| velodyne ", out.partition("All runs")[2], re.MULTILINE)
+    assert "Position error [m]" in out
 
 
 @pytest.mark.parametrize(

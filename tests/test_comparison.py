@@ -9,7 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from comparison_support import aligned, errors, write_map, write_run, write_trajectories
+from comparison_support import (
+    aligned,
+    errors,
+    headlined,
+    write_map,
+    write_run,
+    write_trajectories,
+)
 from evo.core.trajectory import PosePath3D
 from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
@@ -21,7 +28,9 @@ from eval.comparison.table import Cell, Column, Table
 from eval.comparison.tables import make_tables
 from eval.comparison.writing import latex, markdown, write_tables
 from eval.errors import EvalError, FileError
+from eval.evaluation import Verdict, to_sections
 from eval.map_alignment import align_by_poses
+from eval.metrics.metric import Measurement, Section
 
 DATA = Path(os.environ.get("LIFELONG_SLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 PAPER = DATA / "tables" / "paper_000_tables.json"
@@ -169,18 +178,79 @@ def test_maps_are_paired_seed_by_seed(tmp_path):
 def test_settings_that_differ_make_rows_and_the_best_is_marked(tmp_path):
     for i, (pruning, mae, rate) in enumerate([("none", 0.1, 5.0), ("geometry", 0.2, 9.0)]):
         choice = ["scenario=loop", f"pruning={pruning}"]
-        resources = {"scans_per_s": rate, "peak_rss_mb": 500.0}
-        write_run(tmp_path / str(i), choice, errors(mae), resources=resources)
+        trajectory = headlined(errors(mae), position_error=("Position error", mae, "m", True))
+        resources = headlined(
+            {},
+            speed=("Speed", rate, "scans/s", False),
+            memory=("Peak memory", 500.0, "MB", True),
+        )
+        write_run(tmp_path / str(i), choice, trajectory, resources=resources)
     table = tables_of(tmp_path)["headlines"]
     assert table.index == ("pruning",)
     best = dict(zip(table.text(flat=True).columns, table.best().T.tolist(), strict=True))
-    assert best["MAE [m]"] == [True, False]
-    assert best["Scans/s"] == [False, True]
+    assert best["Position error [m]"] == [True, False]
+    assert best["Speed [scans/s]"] == [False, True]
     assert best["Peak memory [MB]"] == [False, False]
+    assert best["Max. error [m]"] == [True, False]
     assert tables_of(tmp_path)["table_5_1"].text(flat=True)["Settings"].tolist() == [
         "pruning=none",
         "pruning=geometry",
     ]
+
+
+class Wobble:
+    """A metric of somebody else."""
+
+    name, title, unit, less_is_better = "wobble", "Wobble", "rad", False
+    section, keys, needs, meaning = Section.MAP, ("wobble",), (), "How it wobbles."
+
+
+def test_a_third_party_metric_appears_with_its_best_value_marked(tmp_path):
+    for i, wobble in enumerate([0.25, 1234.5, None]):
+        found = None if wobble is None else Measurement({"wobble": wobble}, wobble)
+        sections = to_sections([Verdict(Wobble(), found, None if found else "it stands still")])
+        write_run(tmp_path / str(i), ["scenario=A", f"pruning={i}"], **sections)
+    table = tables_of(tmp_path)["headlines"]
+    assert column(table, "Wobble", "[rad]") == ["0.25", "1,234", ""]
+    assert table.best()[:, -1].tolist() == [False, True, False]
+    assert "**1,234**" in markdown([table], [])
+
+
+def test_headlines_of_all_runs_come_in_their_order_and_extras_last(tmp_path):
+    some = {"b": ("B", None, "", None), "a": ("A", 2.0, "m", True), "d": ("D", None, "s", True)}
+    others = {"b": ("B", 3.0, "", None), "c": ("C", 4.0, "%", True)}
+    write_run(tmp_path / "0", ["pruning=none"], headlined(errors(0.1), **some))
+    write_run(
+        tmp_path / "1", ["pruning=geometry"], headlined(errors(0.2), **others), graph={"edges": 7}
+    )
+    table = tables_of(tmp_path)["headlines"]
+    headings = ["pruning", "B", "A [m]", "C [%]", "Max. error [m]", "Edges"]
+    assert table.text(flat=True).columns.tolist() == headings
+    assert column(table, "B") == ["", "3"]
+
+
+def test_a_headline_in_another_unit_is_another_column(tmp_path):
+    for i, unit in enumerate(["m", "cm"]):
+        sections = {"map": headlined({}, a=("A", 1.0, unit, True))}
+        write_run(tmp_path / str(i), [f"pruning={i}"], **sections)
+    table = tables_of(tmp_path)["headlines"]
+    assert column(table, "A", "[m]") == ["1", ""]
+    assert column(table, "A", "[cm]") == ["", "1"]
+
+
+@pytest.mark.parametrize(
+    ("cell", "digits", "text"),
+    [
+        (Cell(0.0123456), None, "0.01235"),
+        (Cell(12345.6), None, "12,346"),
+        (Cell(0.0123456, 0.0009876, 3), None, "0.01235 ± 0.00099"),
+        (Cell(12345.6, 98.76, 3), None, "12,346 ± 99"),
+        (Cell(12345.6, 98.76, 3), 1, "12,345.6 ± 98.8"),
+        (Cell(), None, ""),
+    ],
+)
+def test_figures_have_four_significant_digits_or_as_many_as_are_asked_for(cell, digits, text):
+    assert cell.text(digits) == text
 
 
 def test_a_default_that_was_not_written_down_equals_the_same_choice_written_down(tmp_path):
@@ -255,6 +325,10 @@ def test_folders_without_any_config_stand_for_themselves(tmp_path):
         (tmp_path / name / "metrics.json").write_text(json.dumps(metrics))
     table = tables_of(tmp_path)["table_5_1"]
     assert table.text(flat=True)["Scenario"].tolist() == ["mine", "theirs"]
+    headlines = tables_of(tmp_path)["headlines"]
+    assert list(headlines.rows) == [("mine",), ("theirs",)]
+    assert column(headlines, "Max.") == ["0.2", "0.4"]
+    assert headlines.best()[:, 1].tolist() == [True, False]
 
 
 def test_a_map_that_cannot_be_read_is_a_note(tmp_path):

@@ -79,7 +79,9 @@ def test_metrics_have_every_section(judged):
     assert not {"position_error", "path_length"} & metrics["trajectory"]["reasons"].keys()
     assert metrics["map"]["points"] == 5000
     counts = {"vertices": 3, "edges": 3, "odometry_edges": 2, "loop_edges": 1}
-    assert metrics["graph"] == {**counts, "reasons": {}, "warnings": []}
+    size = {"title": "Pose graph", "value": 3.0, "unit": "vertices", "less_is_better": None}
+    headlines = {"graph_size": size}
+    assert metrics["graph"] == {**counts, "reasons": {}, "warnings": [], "headlines": headlines}
     assert metrics["run"]["seed"] == 3
 
 
@@ -113,6 +115,7 @@ def test_without_reference_the_rest_is_still_there(tmp_path):
     (folder / "reference.tum").unlink()
     metrics = evaluate_run(folder, SETTINGS, {})
     assert metrics["trajectory"]["mae_m"] is None
+    assert metrics["trajectory"]["headlines"]["position_error"]["value"] is None
     assert metrics["trajectory"]["reasons"]["position_error"] == "there is no reference trajectory"
     assert metrics["trajectory"]["path_length_m"] > 119
     assert metrics["resources"]["scans_per_s"] == pytest.approx(40)

@@ -22,7 +22,6 @@ HERE = __name__
 class Count:
     """Counts poses, or whatever it is told."""
 
-    title = "Count"
     section = Section.TRAJECTORY
     unit = ""
     less_is_better = None
@@ -35,9 +34,16 @@ class Count:
         needs: tuple[str, ...] = ("estimate",),
     ):
         self.name, self.keys, self.needs = name, keys, needs
+        self.title = name.capitalize()
 
     def measure(self, evidence):
         return Measurement(dict.fromkeys(self.keys, 3), 3.0, warnings=("doubtful",))
+
+
+class Namesake(Count):
+    def __init__(self):
+        super().__init__()
+        self.name = "namesake"
 
 
 class Refusing(Count):
@@ -148,8 +154,12 @@ def test_sections_have_values_reasons_and_warnings():
         "w": 3,
         "reasons": {"b": "not with these poses"},
         "warnings": ["doubtful"],
+        "headlines": {
+            name: {"title": name.capitalize(), "value": value, "unit": "", "less_is_better": None}
+            for name, value in (("a", 3.0), ("b", None), ("c", 3.0))
+        },
     }
-    assert sections["map"] == {"reasons": {}, "warnings": []}
+    assert sections["map"] == {"reasons": {}, "warnings": [], "headlines": {}}
     assert sections["graph"]["v"] == 3
 
 
@@ -219,6 +229,12 @@ def test_names_are_unique(installed):
     installed(count=f"{HERE}:Count")
     with pytest.raises(MetricError, match="more than one metric is called count"):
         find_metrics([{"_target_": f"{HERE}.Refusing"}])
+
+
+def test_titles_are_unique(installed):
+    installed(namesake=f"{HERE}:Namesake")
+    with pytest.raises(MetricError, match="more than one metric is called Count"):
+        find_metrics([{"_target_": f"{HERE}.Count"}])
 
 
 def test_settings_of_the_group(installed):

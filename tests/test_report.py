@@ -93,12 +93,21 @@ def test_tables_group_the_headers_of_rows_and_columns():
 
 def test_tables_align_text_and_numbers():
     frame = pd.DataFrame(
-        {"name": ["one", "2nd"], "error": [0.1, None], "text": ["0.3 ± 0.1", "1 ★"]}
+        {
+            "name": ["one", "2nd"],
+            "error": [0.1, None],
+            "text": ["0.3 ± 0.1", "1 ★"],
+            "some": ["0.7", ""],
+            "none": ["", ""],
+        }
     )
     html = charts.table(frame)
     assert "<td>one</td>" in html
     assert '<td class="number">\N{EN DASH}</td>' in html
     assert '<td class="number">0.3 ± 0.1</td>' in html
+    assert '<td class="number">0.7</td>' in html
+    assert '<td class="number"></td>' in html
+    assert "<td></td>" in html
     assert 'scope="row"' not in html
 
 

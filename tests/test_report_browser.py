@@ -6,8 +6,12 @@ import time
 
 import numpy as np
 import pytest
+from comparison_support import errors, write_run, write_trajectories
 from report_support import some_evidence, some_verdicts
 
+from eval.comparison.report import write_report
+from eval.comparison.runs import find_runs
+from eval.comparison.tables import make_tables
 from eval.evaluation import Verdict
 from eval.report.run_report import write_run_report
 
@@ -290,6 +294,22 @@ def test_phones_scroll_over_charts(browser, report):
     assert page.locator(f"{CHART} .plot").evaluate("plot => plot.layout.dragmode") is False
     press(page, "drag")
     assert page.locator(f"{CHART} .plot").evaluate("plot => plot.layout.dragmode") == "pan"
+    page.close()
+
+
+def test_comparisons_are_quiet_and_fit_a_phone(browser, tmp_path):
+    """Paths whose labels ask for more room on a phone, and for less when they have it."""
+    for width, height in [(25, 25), (33, 33), (35, 23.1), (50, 50), (70, 46.2), (80, 40)]:
+        folder = write_run(tmp_path / f"{width}", [f"scenario.laps={width}"], errors(0.1))
+        path = [[0, 0, 0], [0.3 * width, height, 0], [width, 0.4 * height, 0]]
+        write_trajectories(folder, np.array(path))
+    runs = find_runs([tmp_path])
+    write_report(tmp_path / "report.html", runs, make_tables(runs.finished))
+    address = (tmp_path / "report.html").as_uri()
+    page = opened(browser, address, is_mobile=True, viewport={"width": 390, "height": 800})
+    assert page.locator(".plot .scatterlayer").count() == 6
+    assert (page.messages, page.requests) == ([], [address])
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
     page.close()
 
 

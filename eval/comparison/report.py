@@ -13,13 +13,15 @@ from eval.comparison.maps import trajectory_alignment
 from eval.comparison.runs import Run, Runs, differing
 from eval.comparison.table import Table
 from eval.comparison.tables import scenario_of
-from eval.report.charts import THINNED, Drawing, draw, table, text
+from eval.report.charts import THINNED, draw, table, text
 from eval.report.encoding import POINTS, thin
 from eval.report.page import Page
+from eval.report.views import from_above
 from eval.trajectory_files import read_tum
 
 Array = NDArray[np.float64]
 
+_PATH = "trajectory.tum"
 _BEST = " ★"
 _COLOURS = 6  # curves in the report's style
 
@@ -28,13 +30,14 @@ def write_report(path: Path, runs: Runs, tables: Sequence[Table]) -> None:
     """Write the page of a comparison, one file that needs no network, replacing it as a whole.
 
     Raises:
-        FileError: a trajectory of a run is missing or malformed.
+        FileError: a trajectory of a run is malformed.
     """
     page = Page("Comparison of runs", f"{len(runs.finished)} runs")
     for each in tables:
         notes = [*each.notes, *([f"The mark is{_BEST}."] if each.best().any() else [])]
         page.add(each.title, " ".join(notes), table(marked(each)))
-    for alike in _on_the_same_scans(runs.finished):
+    with_paths = [run for run in runs.finished if (run.folder / _PATH).is_file()]
+    for alike in _on_the_same_scans(with_paths):
         page.add(_heading(alike), "Each moved onto the reference, if there is one.", paths(alike))
     if runs.missing:
         frame = pd.DataFrame([(run.name, run.reason) for run in runs.missing])
@@ -53,27 +56,22 @@ def marked(table: Table) -> pd.DataFrame:
 def paths(runs: Sequence[Run]) -> Markup:
     """Overlay the paths of runs on the same scans, seen from above, each named by its settings."""
     keys = differing(runs)
-    traces = []
+    traces, shapes = [], []
     reference = runs[0].folder / "reference.tum"
     if reference.is_file():
         line = {"color": "--reference", "width": 5}
-        traces.append(_trace(read_tum(reference).positions_xyz, "reference", line))
+        shapes.append(read_tum(reference).positions_xyz)
+        traces.append(_trace(shapes[0], "reference", line))
     for number, run in enumerate(runs):
-        positions = read_tum(run.folder / "trajectory.tum").positions_xyz
+        positions = read_tum(run.folder / _PATH).positions_xyz
         alignment = trajectory_alignment(run)
         moved = positions if alignment is None else alignment.move(positions)
         name = " ".join(f"{key}={run.setting(key)}" for key in keys) or run.folder.name
         line = {"color": f"--curve-{number % _COLOURS}", "width": 2}
+        shapes.append(moved)
         traces.append(_trace(moved, name, line))
-    layout = {
-        "xaxis": {"title": {"text": "x [m]"}, "hoverformat": ".1f"},
-        "yaxis": {"title": {"text": "y [m]"}, "hoverformat": ".1f", "scaleanchor": "x"},
-        "hovermode": "closest",
-    }
     words = f"Paths of {len(runs)} runs from above."
-    width, height = (max(np.ptp(trace[axis]) for trace in traces) for axis in "xy")
-    aspect = float(np.clip(height / max(width, 1e-9), 0.3, 0.65))
-    return draw(Drawing("Paths", words, traces, layout, THINNED, round(aspect, 2)))
+    return draw(from_above("Paths", words, traces, np.concatenate(shapes), THINNED))
 
 
 def _trace(positions: Array, name: str, line: dict[str, Any]) -> dict[str, Any]:

@@ -56,6 +56,11 @@ class Run:
             value = None
         return self.overrides.get(key) if value is None else str(value)
 
+    @property
+    def is_bare(self) -> bool:
+        """Whether nothing is known of how it was made: it stands for itself."""
+        return not self.choices and not self.overrides
+
     @cached_property
     def seeds(self) -> tuple[tuple[str, str | None], ...]:
         """The seeds on the command line, of SLAM (`seed`) or of the world (`scenario.seed`)."""
@@ -225,8 +230,7 @@ def _newest(runs: Sequence[Run]) -> tuple[tuple[Run, ...], list[Missing]]:
     by_settings: dict[tuple[Any, ...], list[Run]] = {}
     for run in runs:
         settings = (tuple(sorted(run.choices.items())), *(run.setting(key) for key in keys))
-        # A folder without any settings may hold anything: it stands for itself.
-        key = settings if run.choices or run.overrides else (run.folder,)
+        key = (run.folder,) if run.is_bare else settings
         by_settings.setdefault(key, []).append(run)
     newest = {id(max(alike, key=_written)) for alike in by_settings.values()}
     earlier = [run for run in runs if id(run) not in newest]

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from eval.numbers import number
 from eval.statistics import spread
 
 PUBLISHED = "published"
@@ -39,12 +40,15 @@ class Cell:
         half = float("nan") if interval is None else interval[1] - found["mean"]
         return cls(found["mean"], half, len(numbers))
 
-    def text(self, digits: int) -> str:
-        """Return the figure as it is printed."""
+    def text(self, digits: int | None) -> str:
+        """Return the figure as it is printed, with some digits behind the point or four in all."""
         if np.isnan(self.mean):
             return _NOTHING
-        margin = "" if np.isnan(self.half_width) else f" ± {self.half_width:,.{digits}f}"
-        return f"{self.mean:,.{digits}f}{margin}"
+        if digits is None:
+            mean, half_width = number(self.mean), number(self.half_width, 2)
+        else:
+            mean, half_width = f"{self.mean:,.{digits}f}", f"{self.half_width:,.{digits}f}"
+        return mean if np.isnan(self.half_width) else f"{mean} ± {half_width}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +57,12 @@ class Column:
 
     Attributes:
         heading: from the outermost to the innermost level.
-        digits: behind the point.
+        digits: behind the point; None for four in all.
         less_is_better: which of two figures is the better one; None if neither is.
     """
 
     heading: tuple[str, ...]
-    digits: int = 3
+    digits: int | None = 3
     less_is_better: bool | None = None
 
 

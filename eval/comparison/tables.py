@@ -3,7 +3,6 @@
 import logging
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations, permutations
 
 from eval.comparison.maps import MapDistances, compare_maps
@@ -16,6 +15,7 @@ from eval.comparison.published import (
 from eval.comparison.runs import Run, differing
 from eval.comparison.table import OURS, PUBLISHED, Cell, Column, Table
 from eval.errors import EvalError
+from eval.metrics.metric import Section
 
 _log = logging.getLogger(__name__)
 
@@ -32,40 +32,13 @@ _UNALIGNED = (
 _ERRORS = {"mae_m": ("MAE [m]", 3), "max_m": ("Max. [m]", 3), "mse_m2": ("MSE [m²]", 4)}
 
 
-@dataclass(frozen=True, slots=True)
-class Headline:
-    """A figure of metrics.json that runs are compared by.
-
-    Attributes:
-        section: of metrics.json.
-        keys: that lead to it.
-        title: with the unit.
-        digits: behind the point.
-        less_is_better: None if neither is.
-    """
-
-    section: str
-    keys: tuple[str, ...]
-    title: str
-    digits: int
-    less_is_better: bool | None
-
-
-HEADLINES = (
-    Headline("trajectory", ("mae_m",), "MAE [m]", 3, True),
-    Headline("trajectory", ("rmse_m",), "RMSE [m]", 3, True),
-    Headline("trajectory", ("max_m",), "Max. error [m]", 3, True),
-    Headline("trajectory", ("ape_rotation_deg", "mean"), "Rotation [deg]", 3, True),
-    Headline("resources", ("scans_per_s",), "Scans/s", 1, False),
-    Headline("resources", ("cpu_percent",), "CPU [%]", 0, True),
-    Headline("resources", ("peak_rss_mb",), "Peak memory [MB]", 0, True),
-    Headline("graph", ("vertices",), "Vertices", 0, True),
-    Headline("graph", ("edges",), "Edges", 0, True),
-    Headline("graph", ("loop_edges",), "Loop closures", 0, None),
-    Headline("map", ("points",), "Map points", 0, None),
-    Headline("map", ("mean_distance_m", "map_to_reference"), "Map to reference [m]", 3, True),
-    Headline("map", ("thickness_m",), "Surface thickness [m]", 3, True),
-)
+# What trajectories and pruning are compared by besides the headlines: section and key in metrics.json.
+_EXTRAS = {
+    Column(("RMSE [m]",), None, True): ("trajectory", "rmse_m"),
+    Column(("Max. error [m]",), None, True): ("trajectory", "max_m"),
+    Column(("Edges",), None): ("graph", "edges"),
+    Column(("Loop closures",), None): ("graph", "loop_edges"),
+}
 
 
 class Groups:
@@ -189,28 +162,34 @@ def map_table(groups: Groups) -> Table:
 
 
 def headline_table(runs: Sequence[Run]) -> Table:
-    """Return a row for each choice of settings with all headline figures, the best ones marked.
+    """Return a row for each choice of settings with the headlines of all metrics, the best ones marked.
 
     Runs compete with those on the same scans: the same scenario with the same settings.
     """
     keys = sorted(differing(runs), key=lambda key: not key.startswith("scenario"))
     groups: dict[tuple[str, ...], list[Run]] = {}
     for run in runs:
-        groups.setdefault(tuple(run.setting(key) or "" for key in keys), []).append(run)
+        groups.setdefault(_row(run, keys), []).append(run)
     scans = [key for key in keys if key.startswith("scenario")]
     order = sorted(groups, key=lambda settings: settings[: len(scans)])
-    chosen = [h for h in HEADLINES if any(r.figure(h.section, *h.keys) is not None for r in runs)]
+    figures = {run.folder: _figures(run) for run in runs}
+    known = dict.fromkeys(column for found in figures.values() for column in found)
+    columns = [
+        column
+        for column in sorted(known, key=_EXTRAS.__contains__)
+        if any(found.get(column) is not None for found in figures.values())
+    ]
     return Table(
         "headlines",
         "All runs: headline figures",
         ("The best figure on each scenario is marked.", *_about_seeds(runs)),
         tuple(keys) or ("runs",),
-        tuple(Column((h.title,), h.digits, h.less_is_better) for h in chosen),
+        tuple(columns),
         {
-            (key or ("all",)): [
-                Cell.of([run.figure(h.section, *h.keys) for run in groups[key]]) for h in chosen
+            row: [
+                Cell.of([figures[r.folder].get(column) for r in groups[row]]) for column in columns
             ]
-            for key in order
+            for row in order
         },
         contest=len(scans),
     )
@@ -224,6 +203,24 @@ def scenario_of(run: Run) -> str:
 def sensor_of(run: Run) -> str:
     """Return the sensor."""
     return run.setting("sensor") or "sensor"
+
+
+def _row(run: Run, keys: Sequence[str]) -> tuple[str, ...]:
+    """Return what the row of a run begins with: its settings, or its name if it has none."""
+    if run.is_bare:
+        return (run.folder.name, *[""] * (len(keys) - 1))
+    return tuple(run.setting(key) or "" for key in keys) or ("all",)
+
+
+def _figures(run: Run) -> dict[Column, float | None]:
+    """Return the headlines of a run's metrics, in their order, and the extras."""
+    figures = {}
+    for section in Section:
+        for name, known in run.metrics.get(section, {}).get("headlines", {}).items():
+            heading = f"{known['title']} [{known['unit']}]" if known["unit"] else known["title"]
+            column = Column((heading,), None, known["less_is_better"])
+            figures[column] = run.figure(section, "headlines", name, "value")
+    return figures | {column: run.figure(*keys) for column, keys in _EXTRAS.items()}
 
 
 _ByDirection = dict[tuple[str, str], list[MapDistances]]

@@ -82,7 +82,7 @@ class Metric(Protocol):
 
     Attributes:
         name: unique, in snake_case.
-        title: of a few words, for people.
+        title: unique, of a few words, for people.
         section: of metrics.json.
         keys: of the values, unique in the section.
         needs: names of the fields of Evidence without which there is nothing to measure.

@@ -34,8 +34,8 @@ ENVIRONMENT = Environment(
 )
 THINNED = f"Drawn with at most {POINTS:,} points a line; the extremes of each stretch are kept."
 _DASH = "\N{EN DASH}"
-# A cell that belongs to the right: a number, whatever follows it, or a dash.
-_NUMBER = re.compile(rf"[-+±]?[\d.]*\d|{_DASH}$")
+# A cell that may stand in a column of numbers: a number, whatever follows it, a dash, or nothing.
+_NUMBER = re.compile(rf"[-+±]?[\d.]*\d|{_DASH}?$")
 _CURVES = 6  # colours in style.css
 _NAMED = {"estimate": "--estimate", "reference": "--reference"}
 
@@ -138,7 +138,7 @@ def table(frame: pd.DataFrame, caption: str = "") -> Markup:
         corner=corner,
         rows=list(zip(headers, texts, strict=True)),
         numeric=[
-            all(_NUMBER.match(cell) for cell in column) for column in zip(*texts, strict=True)
+            any(column) and all(map(_NUMBER.match, column)) for column in zip(*texts, strict=True)
         ],
         caption=caption,
     )

@@ -30,9 +30,11 @@
 
   // Charts
 
-  function axis(own) {
+  // An axis makes room on its own side only. Room for the labels at its ends moves those labels, which may
+  // then need none: it would never come to rest.
+  function axis(own, automargin) {
     return {
-      automargin: true, gridcolor: "--rule", linecolor: "--rule", zeroline: false, ticks: "outside",
+      automargin, gridcolor: "--rule", linecolor: "--rule", zeroline: false, ticks: "outside",
       ticklen: 4, tickcolor: "--rule", ...own, title: { standoff: 8, font: { size: 13 }, ...own.title },
     };
   }
@@ -49,8 +51,8 @@
       margin: { l: 8, r: 8, t: 8, b: 8 }, paper_bgcolor: "--surface", plot_bgcolor: "--surface",
       font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: "--ink" },
       hoverlabel: { bgcolor: "--raised", bordercolor: "--rule", font: { color: "--ink" } },
-      xaxis: { ...axis(xaxis), ...zoomed(chart, "xaxis") },
-      yaxis: { ...axis(yaxis), ...zoomed(chart, "yaxis") },
+      xaxis: { ...axis(xaxis, "height"), ...zoomed(chart, "xaxis") },
+      yaxis: { ...axis(yaxis, "width"), ...zoomed(chart, "yaxis") },
       ...own,
     });
   }

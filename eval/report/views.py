@@ -22,6 +22,9 @@ _HEIGHT_SCALE = [[step / 4, f"--height-{step}"] for step in range(5)]
 _DOTS = 2000  # that a browser moves smoothly
 _LOOPS = 1500
 _CELLS = 900  # along the longer side of a map
+# Pixels, with room for usual labels: with one scale for both axes, room made for a label changes the range
+# that is shown, whose labels may need other room, and so on.
+_MARGIN = {"l": 72, "r": 8, "t": 8, "b": 48}
 _STRAYS = 98  # percentile where colours end, so that a few stray values don't wash out the rest
 
 
@@ -50,7 +53,7 @@ def trajectories(
     over = "" if comparison is None else " over its reference"
     length = show(float(estimate.path_length))
     words = f"Path of {length} m{over} from above, with {loops} loop closures."
-    return draw(_from_above("Trajectories", words, traces, path, " ".join(captions)))
+    return draw(from_above("Trajectories", words, traces, path, " ".join(captions)))
 
 
 def height_profile(
@@ -91,7 +94,7 @@ def error_along_path(comparison: TrajectoryComparison) -> Markup:
     }
     least, greatest = show(errors.min()), show(errors.max())
     words = f"Path from above, coloured by position error: {least} to {greatest} m."
-    drawing = _from_above("Error along the path", words, [line, dots], path, _clipped(errors))
+    drawing = from_above("Error along the path", words, [line, dots], path, _clipped(errors))
     drawing.layout["coloraxis"] = _colour_axis("error [m]", 0.0, _top(errors), _ERROR_SCALE)
     return draw(drawing)
 
@@ -122,6 +125,29 @@ def map_by_height(points: Points, path: Array | None = None) -> Markup:
     low, high = np.percentile(points[:, 2], (2, 98)).tolist() if len(points) else (0.0, 1.0)
     colours = _colour_axis("height z [m]", low, max(high, low + 0.1), _HEIGHT_SCALE)
     return _map("Map", "Map from above, coloured by height.", points, colours, path, "")
+
+
+def from_above(
+    title: str, words: str, traces: list[dict[str, Any]], shape: Array, caption: str
+) -> Drawing:
+    """Return a drawing with one scale for x and y, in a frame about as wide as what it shows.
+
+    Args:
+        title: a line that names what is shown.
+        words: what somebody who can't see it should know.
+        traces: of plotly.js.
+        shape: (N, 2 or more) positions that the frame is made for.
+        caption: what a reader should know about how it was drawn.
+    """
+    layout = {
+        "xaxis": {"title": {"text": "x [m]"}, "hoverformat": ".1f"},
+        "yaxis": {"title": {"text": "y [m]"}, "hoverformat": ".1f", "scaleanchor": "x"},
+        "hovermode": "closest",
+        "margin": _MARGIN,
+    }
+    width, height = np.ptp(shape[:, :2], axis=0) if len(shape) else (1.0, 1.0)
+    aspect = float(np.clip(height / max(width, 1e-9), 0.3, 0.65))
+    return Drawing(title, words, traces, layout, caption, round(aspect, 2))
 
 
 def _map(
@@ -159,23 +185,9 @@ def _map(
     if path is not None:
         line = {"color": "--ink", "width": 1.2}
         traces.append({**_line(path[_thin_path(path)], "path"), "line": line})
-    drawing = _from_above(title, words, traces, shape, " ".join(filter(None, [sentence, caption])))
+    drawing = from_above(title, words, traces, shape, " ".join(filter(None, [sentence, caption])))
     drawing.layout["coloraxis"] = colours
     return draw(drawing)
-
-
-def _from_above(
-    title: str, words: str, traces: list[dict[str, Any]], shape: Array, caption: str
-) -> Drawing:
-    """Return a drawing with one scale for x and y, in a frame about as wide as what it shows."""
-    layout = {
-        "xaxis": {"title": {"text": "x [m]"}, "hoverformat": ".1f"},
-        "yaxis": {"title": {"text": "y [m]"}, "hoverformat": ".1f", "scaleanchor": "x"},
-        "hovermode": "closest",
-    }
-    width, height = np.ptp(shape[:, :2], axis=0) if len(shape) else (1.0, 1.0)
-    aspect = float(np.clip(height / max(width, 1e-9), 0.3, 0.65))
-    return Drawing(title, words, traces, layout, caption, round(aspect, 2))
 
 
 def _reference(comparison: TrajectoryComparison) -> dict[str, Any]:
