@@ -28,7 +28,7 @@ from lifelong_slam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
 
-_RELEASE_EVERY = 100  # scans; it takes some 20 ms
+_RELEASE_EVERY = 20  # scans; it takes a few milliseconds
 
 
 @dataclass(frozen=True, slots=True)
