@@ -26,6 +26,13 @@ def burn(seconds):
         pass
 
 
+def wait_until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_processor_time_is_this_process_and_its_finished_children():
     with ResourceMonitor() as monitor:
         start = psutil.Process().cpu_times()
@@ -41,17 +48,15 @@ def test_processor_time_is_this_process_and_its_finished_children():
 def test_memory_counts_children_while_they_live(monkeypatch):
     monkeypatch.setattr(resources, "_PERIOD", 0.01)
     with ResourceMonitor() as monitor:
-        alone = monitor.rss_mb()
+        alone, others = monitor.rss_mb(), monitor.latest.child_rss_mb
         child = subprocess.Popen(
             [sys.executable, "-c", HOLDING], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
         child.stdout.readline()
-        while monitor.latest.child_rss_mb < 150:
-            time.sleep(0.01)
+        wait_until(lambda: monitor.latest.child_rss_mb > others + 150)
         assert monitor.peak_rss_mb > alone + 150
         child.communicate(b"\n")
-        while monitor.latest.child_rss_mb > 0:
-            time.sleep(0.01)
+        wait_until(lambda: monitor.latest.child_rss_mb < others + 150)
     assert alone < monitor.mean_rss_mb < monitor.peak_rss_mb
 
 
