@@ -24,7 +24,7 @@ NEAR = 0.2  # metres from a voxel within which a map point stands for it
 APART = 0.3  # metres off a surface from which on that surface doesn't explain a voxel
 MIN_RETURNS = 5  # of a voxel
 MIN_VOXELS = 10  # of an object
-ROUTE_REACH = 30.0  # metres from the route for completeness
+ROUTE_REACH = 30.0  # metres from the route; the map doesn't look for changes further away
 _SURFACE_CHUNK = 200_000  # points at a time
 
 
@@ -66,6 +66,12 @@ class Visit:
     movables: MovableTruth
     surface: Surface
     reference: Trajectory
+
+    def near_route(self, points: Array) -> NDArray[np.bool_]:
+        """Tell which of (N, 3) points are within ROUTE_REACH of the route, seen from above."""
+        route = cKDTree(self.reference.positions[::10, :2])
+        distances, _ = route.query(points[:, :2], distance_upper_bound=ROUTE_REACH)
+        return np.asarray(np.isfinite(distances))
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +157,8 @@ class ChangeMeter:
         stays = latest_stays([v.movables for v in self.visits])
         voxels, owner = seen_voxels([v.movables for v in self.visits], stays)
         gone, new = stays.last < now, (stays.first > 0) & (stays.last == now)
-        counts = np.where(gone[owner], self._gone_counts(voxels, owner, stays), True)
+        counts = visit.near_route(voxels)
+        counts &= np.where(gone[owner], self._gone_counts(voxels, owner, stays), True)
         counts &= np.where(new[owner], self._new_counts(voxels, owner, stays), True)
         there = _has_point(self._maps[now], voxels)
         change = np.where(gone, "gone", np.where(new, "new", "stayed"))
@@ -225,9 +232,7 @@ def score_map(session: int, visit: Visit, points: Array, trajectory: Trajectory)
     errors = trajectory.positions - visit.reference.at(trajectory.stamps)[:, :3, 3]
     distances = visit.surface.distances(points)
     visible = visit.surface.visible
-    route = cKDTree(visit.reference.positions[::10, :2])
-    near, _ = route.query(visible[:, :2], distance_upper_bound=ROUTE_REACH)
-    surface = _voxel_means(visible[np.isfinite(near)])
+    surface = _voxel_means(visible[visit.near_route(visible)])
     return MapScore(
         session=session,
         points=len(points),

@@ -16,7 +16,8 @@ How it is counted:
   session 1 on its truth (Kabsch, all poses), and holds for all sessions: a session that is put in the
   wrong place shows, in the first table and in all others.
 - An object's surface is what the sensor saw of it: the spots where beams returned from it, in any
-  sweep of its stay, in voxels of 0.2 m; voxels with less than 5 returns are left out.
+  sweep of its stay, in voxels of 0.2 m; voxels with less than 5 returns, or more than 30 m from the
+  route, are left out: further away the map doesn't look for changes.
 - A visit is a session. The change itself happens between two; n visits since the change means that the
   n-th session after it has been mapped.
 - *Gone*: of the voxels that were in the map (a point within 0.2 m) after the last session that the

@@ -128,6 +128,14 @@ def test_the_whole_map_is_held_to_the_true_surface() -> None:
     assert score.completeness_20cm == pytest.approx(1 - plate_share, abs=0.01)
 
 
+def test_what_lies_too_far_from_the_route_for_the_map_to_look_at_does_not_count():
+    meter = change.ChangeMeter()
+    near, far = 0, 11  # 33 m from the route
+    meter.measure(visit({1: near, 2: far}), cloud(near, far))
+    scores = meter.measure(visit({}), cloud(far))
+    assert shares(scores) == {1: ("gone", 1, 0.0)}
+
+
 def score(kind: str, what: str, visits: int, share: float) -> Any:
     return change.ObjectScore(1, 1, kind, what, visits, 50, share)
 

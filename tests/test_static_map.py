@@ -6,7 +6,7 @@ from slam_support import World, box, ground, keyframe, planar, pole
 
 from lifelong_slam.geometry import exp, invert, transform
 from lifelong_slam.mapping.static_map import StaticMap, thin
-from lifelong_slam.mapping.submap import HIGH, LOW, Submap, voxel_keys
+from lifelong_slam.mapping.submap import DOUBTED, HIGH, LOW, Submap, voxel_keys
 from lifelong_slam.mapping.view import View
 
 VOXEL = 0.5
@@ -68,6 +68,21 @@ def test_a_submap_is_a_table_from_voxels_to_sums(seed):
     np.testing.assert_allclose(submap.means, [s / total for total, s, _ in rows], atol=1e-5)
     assert np.all(submap.bounds[0] <= submap.means.min(axis=0))
     assert np.all(submap.bounds[1] >= submap.means.max(axis=0))
+
+
+def test_after_an_absence_what_is_gone_leaves_after_three_looks_and_what_stands_is_sure_again():
+    submap = Submap.empty()
+    for _ in range(HIGH):
+        submap.merge(*voxels([[0.1, 0.1, 0.1], [2.1, 0.1, 0.1]]))
+    submap.merge(*voxels([[4.1, 0.1, 0.1]], score=-1))
+    submap.doubt()
+    assert submap.scores.tolist() == [DOUBTED, DOUBTED, -1]
+    for _ in range(DOUBTED + 1):
+        assert submap.static[1]
+        submap.weaken(np.array([1]))
+        submap.merge(*voxels([[0.1, 0.1, 0.1]]))
+    assert submap.static.tolist() == [True, False, False]
+    assert submap.scores[0] == DOUBTED + 3
 
 
 def test_what_stood_for_years_leaves_the_map_like_what_stood_for_a_day():

@@ -58,8 +58,10 @@ class StaticMap:
         return self._submaps
 
     def restore(self, submaps: Mapping[int, Submap]) -> None:
-        """Go on from a saved map, with an odometry that starts anew."""
+        """Go on from a saved map, which the place may have changed since; odometry starts anew."""
         self._submaps = dict(submaps)
+        for submap in submaps.values():
+            submap.doubt()
         self._changed.clear()
         self.forget_views()
 

@@ -9,6 +9,7 @@ Points = NDArray[np.float32]
 Keys = NDArray[np.int64]
 
 LOW, HIGH = -4, 6  # clamps of the score; see `Submap`
+DOUBTED = 2  # the most that a score is after an absence
 _MAX_WEIGHT = 100  # points in a mean, above which old ones fade
 _KEY_BITS = 21  # a voxel's coordinate; 2^20 voxels of 0.2 m are 210 km
 
@@ -102,6 +103,13 @@ class Submap:
         new = ~known
         if np.any(new):
             self._insert(at[new], keys[new], means[new], weights[new], _clamp(scores[new]))
+
+    def doubt(self) -> None:
+        """Lower high scores: what stood when the place was left may have gone meanwhile.
+
+        Hits raise them again; what is gone needs only `DOUBTED + 1` looks to leave the map.
+        """
+        np.minimum(self.scores, DOUBTED, out=self.scores)
 
     def weaken(self, voxels: NDArray[np.intp]) -> None:
         """Take one from the scores of voxels (M,), given by index, and forget those at `LOW`."""
