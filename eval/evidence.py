@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from evo.core.trajectory import PoseTrajectory3D
+from numpy.typing import NDArray
 
 from eval.files import GraphSketch, Timeline
 from eval.grid import Grid
@@ -42,3 +44,13 @@ class Evidence:
     timeline: Timeline | None = None
     run: Mapping[str, Any] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def path_in_map(self) -> NDArray[np.float64] | None:
+        """(N, 3) estimated positions in the frame of the map, None without an estimate."""
+        if self.estimate is None:
+            return None
+        positions: NDArray[np.float64] = self.estimate.positions_xyz
+        if self.comparison is None or self.reference_map is None:
+            return positions
+        return self.comparison.alignment.move(positions)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from evo.core.trajectory import PosePath3D, PoseTrajectory3D
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from eval.alignment import Alignment, Method
 from eval.association import MAX_GAP, associate, pair_by_index
@@ -15,15 +15,13 @@ from eval.errors import AlignmentError, AssociationError
 from eval.evidence import Evidence
 from eval.files import read_graph, read_timeline
 from eval.grid import Grid, read_grid
-from eval.map_alignment import align_by_poses
+from eval.map_alignment import map_alignment
 from eval.nearest import Points
 from eval.relations import Relations, read_relations
 from eval.trajectory import TrajectoryComparison, compare_pairs
 from eval.trajectory_files import read_trajectory
 
 _BLOCK = 1_000_000
-_AS_WELL = 1.5  # times the position error that another alignment may have
-_PRECISION = 1e-3  # metres, of trajectory files
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,26 +94,6 @@ def read_evidence(
         run=run or {},
         reasons={"comparison": reason} if reason else {},
     )
-
-
-def map_alignment(comparison: TrajectoryComparison) -> Alignment:
-    """Return what moves the estimated map into the frame of the reference.
-
-    That is the alignment of the trajectories; but positions leave the roll about a nearly straight
-    path open, which moves no pose and turns the map. So with SE(3), orientations count as well,
-    unless the positions then fit worse: then these are orientations of another body.
-    """
-    by_positions, pairs = comparison.alignment, comparison.pairs
-    if by_positions.method != "se3":
-        return by_positions
-    by_poses = align_by_poses(pairs.estimate, pairs.reference)
-    distances = by_poses.move(pairs.estimate.positions_xyz) - pairs.reference.positions_xyz
-    fits = _rms(distances) <= _AS_WELL * _rms(comparison.differences) + _PRECISION
-    return by_poses if fits else by_positions
-
-
-def _rms(differences: NDArray[np.float64]) -> float:
-    return float(np.sqrt((differences**2).sum(axis=1).mean()))
 
 
 def _compare(

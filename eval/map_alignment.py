@@ -6,10 +6,33 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eval.alignment import Alignment, kabsch
+from eval.trajectory import TrajectoryComparison
 
 Array = NDArray[np.float64]
 
 LEVER = 20.0  # m; how far from the sensor the points of a map typically are
+_AS_WELL = 1.5  # times the position error that another alignment may have
+_PRECISION = 1e-3  # metres, of trajectory files
+
+
+def map_alignment(comparison: TrajectoryComparison) -> Alignment:
+    """Return what moves the estimated map into the frame of the reference.
+
+    That is the alignment of the trajectories; but positions leave the roll about a nearly straight
+    path open, which moves no pose and turns the map. So with SE(3), orientations count as well,
+    unless the positions then fit worse: then these are orientations of another body.
+    """
+    by_positions, pairs = comparison.alignment, comparison.pairs
+    if by_positions.method != "se3":
+        return by_positions
+    by_poses = align_by_poses(pairs.estimate, pairs.reference)
+    distances = by_poses.move(pairs.estimate.positions_xyz) - pairs.reference.positions_xyz
+    fits = _rms(distances) <= _AS_WELL * _rms(comparison.differences) + _PRECISION
+    return by_poses if fits else by_positions
+
+
+def _rms(differences: Array) -> float:
+    return float(np.sqrt((differences**2).sum(axis=1).mean()))
 
 
 def align_by_poses(estimate: PosePath3D, reference: PosePath3D, lever: float = LEVER) -> Alignment:

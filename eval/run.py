@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from eval.evaluation import Settings, Verdict, evaluate, to_sections
 from eval.evidence import Evidence
@@ -92,19 +91,12 @@ def _write_plots(folder: Path, evidence: Evidence, verdicts: Sequence[Verdict]) 
             evidence.estimate, evidence.comparison, evidence.graph
         )
     if evidence.map is not None:
-        figures["map"] = plots.map_from_above(evidence.map, _path_in_map(evidence))
+        path = evidence.path_in_map
+        figures["map"] = plots.map_from_above(
+            evidence.map, np.zeros((0, 3)) if path is None else path
+        )
     for name, figure in figures.items():
         plots.save(figure, folder / f"{name}.png")
-
-
-def _path_in_map(evidence: Evidence) -> NDArray[np.float64]:
-    """Return the (N, 3) estimated positions in the frame of the map, which a reference moves."""
-    if evidence.estimate is None:
-        return np.zeros((0, 3))
-    positions: NDArray[np.float64] = evidence.estimate.positions_xyz
-    if evidence.comparison is None or evidence.reference_map is None:
-        return positions
-    return evidence.comparison.alignment.move(positions)
 
 
 def _config_text(folder: Path) -> str:

@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from scipy.spatial.transform import Rotation
 
 from eval.comparison import published
-from eval.comparison.maps import compare_maps, map_alignment
+from eval.comparison.maps import compare_maps, run_map_alignment
 from eval.comparison.runs import Run, find_runs, read_run
 from eval.comparison.table import Cell, Column, Table
 from eval.comparison.tables import make_tables
@@ -128,7 +128,7 @@ def test_a_straight_path_does_not_leave_the_roll_of_a_map_to_chance(tmp_path):
     (folder / "trajectory.tum").rename(tmp_path / "estimate.tum")
     write_trajectories(folder, line)
     (tmp_path / "estimate.tum").rename(folder / "trajectory.tum")
-    found = map_alignment(read_run(folder))
+    found = run_map_alignment(read_run(folder))
     assert Rotation.from_matrix(found.R).magnitude() < np.radians(0.01)
 
 
@@ -147,7 +147,7 @@ def test_alignment_by_poses_is_exact_where_one_fits():
 
 def test_other_alignments_hold_for_the_map_as_they_are(tmp_path):
     folder = write_run(tmp_path / "run", [], errors(1, 2, aligned("sim3", TURN, (1, 2, 3), 2.0)))
-    found = map_alignment(read_run(folder))
+    found = run_map_alignment(read_run(folder))
     np.testing.assert_allclose(found.move(np.eye(3)), 2 * TURN.apply(np.eye(3)) + [1, 2, 3])
 
 

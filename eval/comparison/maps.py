@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eval.alignment import Alignment
-from eval.association import associate
 from eval.comparison.runs import Run
-from eval.map_alignment import align_by_poses
+from eval.map_alignment import map_alignment
 from eval.map_files import read_map
 from eval.nearest import mutual_distances
+from eval.trajectory import compare_trajectories
 from eval.trajectory_files import read_tum
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def compare_maps(first: Run, second: Run) -> MapPair:
         EvalError: a map or trajectory is missing, unreadable or empty.
     """
     maps = [read_map(run.folder / "map.ply") for run in (first, second)]
-    alignments = [found for run in (first, second) if (found := map_alignment(run)) is not None]
+    alignments = [found for run in (first, second) if (found := run_map_alignment(run)) is not None]
     aligned = len(alignments) == len(maps)
     if aligned:
         maps = [
@@ -72,11 +72,10 @@ def trajectory_alignment(run: Run) -> Alignment | None:
     return Alignment(found["method"], R, t, found["scale"])
 
 
-def map_alignment(run: Run) -> Alignment | None:
+def run_map_alignment(run: Run) -> Alignment | None:
     """Return what moves the map of a run into the reference's frame; None if there is no reference.
 
-    Where the trajectory was aligned by its positions (`se3`), its poses are aligned instead, which also
-    fixes the rotation about a straight path. Any other method holds for the map as well.
+    See `eval.map_alignment`; a method other than `se3` holds for the map as it was found for the run.
 
     Raises:
         EvalError: estimate or reference are missing, malformed, or don't match.
@@ -87,8 +86,7 @@ def map_alignment(run: Run) -> Alignment | None:
     estimate, reference = (
         read_tum(run.folder / f"{name}.tum") for name in ("trajectory", "reference")
     )
-    pairs = associate(estimate, reference)
-    return align_by_poses(pairs.estimate, pairs.reference)
+    return map_alignment(compare_trajectories(estimate, reference))
 
 
 def _summary(distances: Array) -> MapDistances:

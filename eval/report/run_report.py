@@ -104,7 +104,7 @@ def _views(section: Section, evidence: Evidence, verdicts: Sequence[Verdict]) ->
     if section is Section.TRAJECTORY and evidence.estimate is not None:
         yield from _trajectory_views(evidence)
     if section is Section.MAP and evidence.map is not None:
-        yield _map_view(evidence.map, _driven(evidence), _distances(evidence.map, verdicts))
+        yield _map_view(evidence.map, evidence.path_in_map, _distances(evidence.map, verdicts))
 
 
 def _trajectory_views(evidence: Evidence) -> Iterator[Markup]:
@@ -137,16 +137,6 @@ def _map_view(points: Points, path: Array | None, distances: Array | None) -> Ma
         "what only one of the two maps has seen is far away without being wrong."
     )
     return charts.group("The map", sentence, views.map_by_distance(points, distances, path))
-
-
-def _driven(evidence: Evidence) -> Array | None:
-    """Return the (N, 3) estimated positions in the frame of the map, which a reference moves."""
-    if evidence.estimate is None:
-        return None
-    positions: Array = evidence.estimate.positions_xyz
-    if evidence.comparison is None or evidence.reference_map is None:
-        return positions
-    return evidence.comparison.alignment.move(positions)
 
 
 def _distances(points: Points, verdicts: Sequence[Verdict]) -> Array | None:
