@@ -9,6 +9,7 @@ import numpy as np
 from eval.errors import EvidenceError, MetricError
 from eval.evidence import Evidence
 from eval.metrics.metric import Array, Curve, Measurement, Plot, Section
+from eval.metrics.percentiles import DEFAULT, checked, spread
 from eval.nearest import mutual_distances
 
 _TINY = 100  # points
@@ -66,15 +67,13 @@ class MapDistance:
         " never less than the spacing of the reference's points allows."
     )
 
-    def __init__(self, percentiles: Sequence[float] = (50, 75, 90, 95, 99)) -> None:
+    def __init__(self, percentiles: Sequence[float] = DEFAULT) -> None:
         """Choose the percentiles, from 0 to 100.
 
         Raises:
             MetricError: there are others.
         """
-        if not all(0 <= percentile <= 100 for percentile in percentiles):
-            raise MetricError(f"percentiles go from 0 to 100, not {[*percentiles]}")
-        self._percentiles = tuple(percentiles)
+        self._percentiles = checked(percentiles)
 
     def measure(self, evidence: Evidence) -> Measurement:
         """Average the distances in each direction.
@@ -87,8 +86,8 @@ class MapDistance:
         values = {
             "mean_distance_m": _both_ways(there, back, (there + back) / 2),
             "distance_percentiles_m": {
-                "map_to_reference": self._spread(distances.there),
-                "reference_to_map": self._spread(distances.back),
+                "map_to_reference": spread(distances.there, self._percentiles),
+                "reference_to_map": spread(distances.back, self._percentiles),
             },
         }
         plot = Plot(
@@ -102,10 +101,6 @@ class MapDistance:
         )
         samples = {"distance_m": distances.there}
         return Measurement(values, there, samples, (plot,), distances.warnings)
-
-    def _spread(self, distances: Array) -> dict[str, float]:
-        found = np.percentile(distances, self._percentiles).tolist()
-        return {f"{p:g}": value for p, value in zip(self._percentiles, found, strict=True)}
 
 
 class Hausdorff:

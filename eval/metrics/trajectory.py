@@ -9,6 +9,7 @@ from evo.core.metrics import RPE
 from eval.errors import EvalError, MetricError
 from eval.evidence import Evidence
 from eval.metrics.metric import Array, Curve, Measurement, Plot, Section
+from eval.metrics.percentiles import DEFAULT, checked, spread
 from eval.relative import RelativeErrors, over_distance, over_kitti_segments, over_time
 from eval.trajectory import TrajectoryComparison
 
@@ -41,15 +42,13 @@ class PositionError:
     less_is_better: bool | None = True
     meaning = "How far the estimated position is from the true one, on average over all poses."
 
-    def __init__(self, percentiles: Sequence[float] = (50, 75, 90, 95, 99)) -> None:
+    def __init__(self, percentiles: Sequence[float] = DEFAULT) -> None:
         """Choose the percentiles, from 0 to 100.
 
         Raises:
             MetricError: there are others.
         """
-        if not all(0 <= percentile <= 100 for percentile in percentiles):
-            raise MetricError(f"percentiles go from 0 to 100, not {[*percentiles]}")
-        self._percentiles = tuple(percentiles)
+        self._percentiles = checked(percentiles)
 
     def measure(self, evidence: Evidence) -> Measurement:
         """Sum up the differences of paired positions."""
@@ -57,7 +56,6 @@ class PositionError:
         errors, differences = comparison.errors, comparison.differences
         x, y, z = np.abs(differences).mean(axis=0).tolist()
         statistics = summary(errors)
-        percentiles = np.percentile(errors, self._percentiles).tolist()
         values = {
             "mae_m": statistics["mean"],
             "mae_x_m": x,
@@ -66,9 +64,7 @@ class PositionError:
             "mse_m2": float((errors**2).mean()),
             "rmse_m": statistics["rmse"],
             "max_m": statistics["max"],
-            "percentiles_m": {
-                f"{p:g}": value for p, value in zip(self._percentiles, percentiles, strict=True)
-            },
+            "percentiles_m": spread(errors, self._percentiles),
             "ape_translation_m": statistics,
         }
         samples = {"error_m": errors, **{f"{a}_m": differences[:, i] for i, a in enumerate("xyz")}}
