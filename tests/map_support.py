@@ -1,7 +1,9 @@
 """What the tests of saved maps share: a sensor that drives through boxes, written keyframe by keyframe."""
 
+import hashlib
 import os
 import signal
+from dataclasses import fields, is_dataclass
 
 import numpy as np
 
@@ -149,3 +151,34 @@ def eventful(session, vertices):
         submaps={i: voxels(rng)},
         places={i: cloud(rng, 200)},
     )
+
+
+def load(path):
+    with MapStore.open(path, read_only=True) as store:
+        return store.load()
+
+
+def contents(folder):
+    """A hash of each file in a folder."""
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir()}
+
+
+def assert_same(one, other):
+    """Compare nested dataclasses, mappings and lists with arrays in them, to the last digit."""
+    assert type(one) is type(other)
+    if is_dataclass(one):
+        for field in fields(one):
+            assert_same(getattr(one, field.name), getattr(other, field.name))
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other)
+        for pair in zip(one, other, strict=True):
+            assert_same(*pair)
+    elif isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    else:
+        assert one == other

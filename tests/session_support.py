@@ -10,7 +10,6 @@ from test_slam import RADIUS, VOXEL, DriftingOdometry, on_the_circle, pipeline
 
 from lifelong_slam.geometry import invert
 from lifelong_slam.mapping.session import MapSession
-from lifelong_slam.mapping.store import MapStore
 from lifelong_slam.scan import NANOSECONDS
 
 SETTINGS = {
@@ -78,11 +77,6 @@ def cut_off(path, drive):
         slam.begin(session)
         for scan in drive.scans:
             slam.process(scan)
-
-
-def load(path):
-    with MapStore.open(path, read_only=True) as store:
-        return store.load()
 
 
 def parts(saved):

@@ -10,11 +10,11 @@ from signal import SIGKILL
 
 import numpy as np
 import pytest
+from map_support import load
 from session_support import (
     SESSION_GAP,
     SETTINGS,
     circle_town,
-    load,
     open_session,
     record_drive,
     run_session,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_support import new_map
+from map_support import assert_same, contents, load, new_map
 from omegaconf import OmegaConf
 from run_support import ListSource
 from scipy.spatial import cKDTree
@@ -16,13 +16,11 @@ from session_support import (
     WINDOW,
     circle_town,
     cut_off,
-    load,
     open_session,
     parts,
     record_drive,
     run_session,
 )
-from test_map_store import assert_same, contents
 from test_slam import VOXEL, errors, pipeline
 
 import run
