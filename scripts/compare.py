@@ -21,7 +21,6 @@ The tables are printed as well.
 Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
 """
 
-import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,16 +30,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from console import fail
+from command import run_command
 from eval.comparison.report import write_report
 from eval.comparison.runs import find_runs
 from eval.comparison.tables import make_tables
 from eval.comparison.writing import markdown, write_tables
-from eval.errors import EvalError
 from lifelong_slam.config import check_value
-from lifelong_slam.errors import ConfigError, LifelongSlamError, did_you_mean
-
-BAD_INPUT, INTERRUPTED = 2, 130
+from lifelong_slam.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -53,20 +49,18 @@ class Settings:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compare runs and return the exit status."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
-        return 0
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    try:
-        compare(parse(arguments))
-    except (LifelongSlamError, EvalError, OSError) as error:
-        fail(error)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("Stopped: nothing is written.", file=sys.stderr)
-        return INTERRUPTED
-    return 0
+    return run_command(compare, arguments, __doc__, "Stopped: nothing is written.")
+
+
+def compare(arguments: Sequence[str]) -> None:
+    """Read the runs, write tables and report, print the tables."""
+    settings = parse(arguments)
+    runs = find_runs(settings.runs)
+    tables = make_tables(runs.finished)
+    write_tables(settings.out, tables, runs.missing)
+    write_report(settings.out / "report.html", runs, tables)
+    print(markdown(tables, runs.missing))
+    print(f"Written to: {settings.out}")
 
 
 def parse(arguments: Sequence[str]) -> Settings:
@@ -91,16 +85,6 @@ def parse(arguments: Sequence[str]) -> Settings:
     return Settings(
         runs, Path(check_value("out", given.get("out", str(runs[0] / "comparison")), str))
     )
-
-
-def compare(settings: Settings) -> None:
-    """Read the runs, write tables and report, print the tables."""
-    runs = find_runs(settings.runs)
-    tables = make_tables(runs.finished)
-    write_tables(settings.out, tables, runs.missing)
-    write_report(settings.out / "report.html", runs, tables)
-    print(markdown(tables, runs.missing))
-    print(f"Written to: {settings.out}")
 
 
 if __name__ == "__main__":

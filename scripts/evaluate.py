@@ -36,16 +36,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from console import fail
+from command import compose_config, plain, run_command
 from eval.errors import EvalError
 from eval.evaluation import Verdict, evaluate, make_settings
 from eval.evidence import Evidence
@@ -53,54 +50,26 @@ from eval.evidence_files import EvidenceFiles, read_evidence
 from eval.numbers import number
 from eval.run import earlier_info, run_files, write_results
 from lifelong_slam.config import check_value
-from lifelong_slam.errors import ConfigError, LifelongSlamError
-from lifelong_slam.overrides import check_overrides
+from lifelong_slam.errors import ConfigError
 
-CONF = Path(__file__).resolve().parent.parent / "conf"
-KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
-BAD_INPUT, INTERRUPTED = 2, 130
 TOPICS = ("topic", "reference_topic")
 ARCHIVE = "evo_ape.zip"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Judge files and return the exit status."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
-        return 0
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
-    try:
-        judge(compose_config(arguments))
-    except KNOWN_ERRORS as error:
-        fail(error)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("Stopped.", file=sys.stderr)
-        return INTERRUPTED
-    return 0
+    return run_command(judge, arguments, __doc__, "Stopped.", logging.WARNING)
 
 
-def compose_config(arguments: Sequence[str]) -> DictConfig:
-    """Return the config that a command line asks for.
-
-    Raises:
-        ConfigError: an argument is no setting.
-    """
-    check_overrides(CONF, arguments, "evaluate")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: DictConfig = compose("evaluate", overrides=[*arguments])
-    return config
-
-
-def judge(config: DictConfig) -> None:
+def judge(arguments: Sequence[str]) -> None:
     """Read the files, judge them, show and write what was found.
 
     Raises:
-        ConfigError: there is nothing to judge.
+        ConfigError: an argument is no setting, or there is nothing to judge.
         EvalError: a file is missing or malformed, or the trajectories can't be compared.
     """
-    settings = make_settings(_plain(config.eval))
+    config = compose_config("evaluate", arguments)
+    settings = make_settings(plain(config.eval))
     run, out = (_path(config, key) for key in ("run", "out"))
     files = given_files(config, EvidenceFiles() if run is None else run_files(run))
     if files == EvidenceFiles():
@@ -166,10 +135,6 @@ _BETTER = {True: "less", False: "more", None: ""}
 def _path(config: DictConfig, key: str) -> Path | None:
     name = check_value(key, config[key], str | None)
     return None if name is None else Path(name)
-
-
-def _plain(config: DictConfig) -> dict[str, Any]:
-    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
 
 
 if __name__ == "__main__":

@@ -23,35 +23,25 @@ pruned, and optimised again. Settings, with their defaults in conf/prune.yaml:
 Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
 """
 
-import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
-from console import fail
-from eval.errors import EvalError
+from command import compose_config, run_command
 from eval.files import write_json
 from eval.vertices import Array, rmse, vertex_distances
 from lifelong_slam.config import build, check_value
-from lifelong_slam.errors import ConfigError, LifelongSlamError
+from lifelong_slam.errors import ConfigError
 from lifelong_slam.graph.reduction import Reduction, State, reduce
 from lifelong_slam.io.g2o import read_g2o, write_g2o
 from lifelong_slam.io.graph_truth import read_truth
-from lifelong_slam.overrides import check_overrides
 from lifelong_slam.provenance import describe_run, seed_everything
-
-CONF = Path(__file__).resolve().parent.parent / "conf"
-KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
-BAD_INPUT, INTERRUPTED = 2, 130
 
 
 @dataclass(frozen=True)
@@ -69,34 +59,13 @@ class Settings:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Reduce a graph and return the exit status."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
-        return 0
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    try:
-        config = compose_config(arguments)
-        facts = prune(parse(config), config, arguments)
-    except KNOWN_ERRORS as error:
-        fail(error)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("Stopped: nothing is written.", file=sys.stderr)
-        return INTERRUPTED
-    show(facts)
-    return 0
+    return run_command(work, arguments, __doc__, "Stopped: nothing is written.")
 
 
-def compose_config(arguments: Sequence[str]) -> DictConfig:
-    """Return the config that a command line asks for.
-
-    Raises:
-        ConfigError: an argument is no setting, or names a method that isn't there.
-    """
-    check_overrides(CONF, arguments, "prune")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: DictConfig = compose("prune", overrides=[*arguments])
-    return config
+def work(arguments: Sequence[str]) -> None:
+    """Do what the command line says, and show what it changes."""
+    config = compose_config("prune", arguments)
+    show(prune(parse(config), config, arguments))
 
 
 def parse(config: DictConfig) -> Settings:

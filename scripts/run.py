@@ -10,22 +10,20 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
+from command import BAD_INPUT, CONF, INTERRUPTED, KNOWN_ERRORS, plain
 from console import fail, scan_progress, show_results
-from eval.errors import EvalError
 from eval.evaluation import make_settings
 from eval.run import evaluate_run
 from lifelong_slam.config import build, check_value
-from lifelong_slam.errors import ConfigError, LifelongSlamError
+from lifelong_slam.errors import ConfigError
 from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.overrides import check_overrides
 from lifelong_slam.provenance import describe_run, seed_everything
@@ -36,13 +34,10 @@ from lifelong_slam.sources.source import Source, Surveyed
 from lifelong_slam.systems.system import System
 from lifelong_slam.viewer import StubViewer
 
-CONF = str(Path(__file__).resolve().parent.parent / "conf")
-KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
-BAD_INPUT, INTERRUPTED = 2, 130
 FILES_OF_THE_START = {".hydra", "run.log", "run.rrd"}
 
 
-@hydra.main(config_path=CONF, config_name="config", version_base="1.3")  # type: ignore[untyped-decorator]
+@hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")  # type: ignore[untyped-decorator]
 def job(config: DictConfig) -> None:
     """Do one run, in the folder that Hydra made for it."""
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -89,11 +84,6 @@ def part(config: DictConfig, group: str) -> DictConfig:
     if not isinstance(node, DictConfig):
         raise ConfigError(f"nothing is chosen for {group}: give {group}=...")
     return node
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """Return a config as dictionaries, lists and values."""
-    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
 
 
 @contextmanager
@@ -152,7 +142,7 @@ def check_command_line() -> None:
         more = Path(arguments.config_dir) if arguments.config_dir else None
         if more and not more.is_dir():
             raise ConfigError(f"no such folder of configs: {more}")
-        check_overrides(Path(CONF), arguments.overrides, arguments.config_name or "config", more)
+        check_overrides(CONF, arguments.overrides, arguments.config_name or "config", more)
 
 
 def prepare_launcher() -> None:

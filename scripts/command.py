@@ -1,0 +1,74 @@
+"""What the commands share: which errors are the user's to mend, exit statuses, composing a config."""
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from console import fail
+from eval.errors import EvalError
+from lifelong_slam.errors import LifelongSlamError
+from lifelong_slam.overrides import check_overrides
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+def run_command(
+    work: Callable[[Sequence[str]], None],
+    arguments: Sequence[str] | None,
+    usage: str | None,
+    when_stopped: str,
+    level: int = logging.INFO,
+) -> int:
+    """Do a command's work, turn whatever went wrong into one line, and return the exit status.
+
+    Args:
+        work: takes the arguments.
+        arguments: those of the process if None.
+        usage: printed instead if they ask for help.
+        when_stopped: said when Ctrl-C ends the work.
+        level: from which on messages are shown.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & {*arguments}:
+        print(usage)
+        return 0
+    logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr)
+    try:
+        work(arguments)
+    except KNOWN_ERRORS as error:
+        fail(error)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(when_stopped, file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def compose_config(name: str, arguments: Sequence[str]) -> DictConfig:
+    """Return the config that a command line asks for.
+
+    Args:
+        name: of the primary config in conf/.
+        arguments: overrides.
+
+    Raises:
+        ConfigError: an argument is no setting, or names a choice that isn't there.
+    """
+    check_overrides(CONF, arguments, name)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config: DictConfig = compose(name, overrides=[*arguments])
+    return config
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """Return a config as dictionaries, lists and values."""
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
