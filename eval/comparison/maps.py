@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class MapDistances:
+class DistanceSummary:
     """How far the points of one map are from another map, in one direction.
 
     Attributes:
@@ -39,8 +39,8 @@ class MapPair:
         aligned: whether both maps were moved into the reference's frame first.
     """
 
-    there: MapDistances
-    back: MapDistances
+    there: DistanceSummary
+    back: DistanceSummary
     aligned: bool
 
 
@@ -89,5 +89,5 @@ def run_map_alignment(run: Run) -> Alignment | None:
     return map_alignment(compare_trajectories(estimate, reference))
 
 
-def _summary(distances: Array) -> MapDistances:
-    return MapDistances(float(distances.mean()), float(distances.max()))
+def _summary(distances: Array) -> DistanceSummary:
+    return DistanceSummary(float(distances.mean()), float(distances.max()))

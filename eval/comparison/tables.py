@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations, permutations
 
-from eval.comparison.maps import MapDistances, compare_maps
+from eval.comparison.maps import DistanceSummary, compare_maps
 from eval.comparison.published import (
     SENSORS,
     SOURCE,
@@ -223,7 +223,7 @@ def _figures(run: Run) -> dict[Column, float | None]:
     return figures | {column: run.figure(*keys) for column, keys in _EXTRAS.items()}
 
 
-_ByDirection = dict[tuple[str, str], list[MapDistances]]
+_ByDirection = dict[tuple[str, str], list[DistanceSummary]]
 
 
 def _map_distances(name: str, runs: Sequence[Run], notes: list[str]) -> _ByDirection:
