@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 UNPRUNED = "none"
 COLUMNS = (
-    "hours", "vertices", "edges", "back_end_s", "prune_s", "optimise_ms", "memory_mb", "ape_m"
+    "hours", "cells", "vertices", "edges", "back_end_s", "prune_s", "optimise_ms", "memory_mb", "ape_m"
 )  # fmt: skip
 LAW = (
     "Back-end time of an unpruned run beyond its budget: a h + b h^2 with a, b >= 0, least squares on what"
@@ -39,7 +39,8 @@ class Run:
         method: of pruning.
         wrong: share of wrong loop closures.
         seed: of the run; runs with the same seed and share have the same keyframes.
-        curves: (S,) by column of COLUMNS; back_end_s is NaN where it was not measured.
+        curves: (S,) by column of COLUMNS; back_end_s is NaN where it was not measured. `cells` is the
+            size of the place: square cells, 4 m wide, that the robot has entered so far.
         positions: (K, 3) of all keyframes at the end, metres.
     """
 
@@ -64,10 +65,10 @@ class Run:
         curve = self.back_end_s if column == "back_end_s" else self.curves[column]
         return float(curve[-1])
 
-    def growth(self) -> float:
-        """Return the ratio of the vertices at the end to those after a fifth of the run."""
-        hours, vertices = self.curves["hours"], self.curves["vertices"]
-        return float(vertices[-1] / np.interp(_EARLY * hours[-1], hours, vertices))
+    def growth(self, column: str) -> float:
+        """Return the ratio of a curve's last value to that after a fifth of the run."""
+        hours, curve = self.curves["hours"], self.curves[column]
+        return float(curve[-1] / np.interp(_EARLY * hours[-1], hours, curve))
 
 
 def position_rmse(estimate: Array, reference: Array) -> float:
@@ -100,7 +101,7 @@ def summarise(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
     Those of `compared` are taken seed by seed, where both runs are there:
 
-    - vertices: at the end over those after a fifth of the run;
+    - vertices, cells: at the end over those after a fifth of the run;
     - ape, speed_up, map_error_m: against the unpruned run, how many times larger the error, how many times
       less the back-end time, and how far off the map;
     - ape_of_wrong: how many times larger the error is than without wrong closures.
@@ -144,7 +145,7 @@ def _rows(run: Run) -> list[dict[str, Any]]:
 def _compared(
     group: list[Run], by_key: dict[tuple[str, float, int], Run]
 ) -> dict[str, list[float]]:
-    figures: dict[str, list[float]] = {"vertices": [run.growth() for run in group]}
+    figures = {name: [run.growth(name) for run in group] for name in ("vertices", "cells")}
     for run in group:
         unpruned = by_key.get((UNPRUNED, run.wrong, run.seed))
         right = by_key.get((run.method, 0.0, run.seed))

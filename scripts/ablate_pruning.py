@@ -41,7 +41,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.box import MARKDOWN
@@ -49,21 +48,19 @@ from rich.console import Console
 from rich.table import Table
 
 from ablation_jobs import Job, run_all
-from console import fail
+from command import compose_config, plain, run_command
 from eval.ablation import LAW, UNPRUNED, Run, rows, summarise
 from eval.ablation_plots import PANELS, overview, save, single
 from eval.files import atomic_path, write_json
-from lifelong_slam.errors import ConfigError, LifelongSlamError
-from lifelong_slam.overrides import check_overrides
+from lifelong_slam.errors import ConfigError
 from lifelong_slam.provenance import describe_run
 
-CONF = Path(__file__).resolve().parent.parent / "conf"
-BAD_INPUT, INTERRUPTED = 2, 130
 _WIDTH = 240  # columns of what is printed, enough for no cell to be cut
 # What is printed: heading, section and name in the summary, digits.
 SHOWN: tuple[tuple[str, str, str, int], ...] = (
     ("vertices", "final", "vertices", 0),
     ("over 1/5", "compared", "vertices", 3),
+    ("place over 1/5", "compared", "cells", 3),
     ("edges", "final", "edges", 0),
     ("time s", "final", "back_end_s", 1),
     ("speed-up", "compared", "speed_up", 1),
@@ -93,25 +90,18 @@ class Settings:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Do the runs that aren't there yet, report on all, and return the exit status."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & {*arguments}:
-        print(__doc__)
-        return 0
-    try:
-        plan = parse(arguments)
-        todo = [job for job in plan.jobs() if not job.is_done(plan.out)]
-        for job in run_all(todo, plan.out, plan.settings.jobs):
-            print(f"{job.method}, {job.wrong:g} wrong, seed {job.seed}: done", file=sys.stderr)
-            report(plan, arguments)
-    except LifelongSlamError as error:
-        fail(error)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("Stopped: the runs that were done are kept.", file=sys.stderr)
-        return INTERRUPTED
+    return run_command(ablate, arguments, __doc__, "Stopped: the runs that were done are kept.")
+
+
+def ablate(arguments: Sequence[str]) -> None:
+    """Do the runs that aren't there yet, and report on all."""
+    plan = parse(arguments)
+    todo = [job for job in plan.jobs() if not job.is_done(plan.out)]
+    for job in run_all(todo, plan.out, plan.settings.jobs):
+        print(f"{job.method}, {job.wrong:g} wrong, seed {job.seed}: done", file=sys.stderr)
+        report(plan, arguments)
     show(report(plan, arguments))
     draw(plan)
-    return 0
 
 
 def parse(arguments: Sequence[str]) -> "Plan":
@@ -213,11 +203,7 @@ def pruning_config(method: str, seed: int, overrides: tuple[str, ...]) -> dict[s
         f"pruning={method}",
         *(o.replace(method, "pruning", 1) for o in overrides),
     ]
-    check_overrides(CONF, lines)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", overrides=lines).pruning, resolve=True)
-    assert isinstance(config, dict)
-    return {str(key): value for key, value in config.items()}
+    return plain(compose_config("config", lines).pruning)
 
 
 def report(plan: Plan, arguments: Sequence[str]) -> list[dict[str, Any]]:

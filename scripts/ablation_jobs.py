@@ -19,6 +19,8 @@ from lifelong_slam.graph.ablation import Sample, drive
 from lifelong_slam.provenance import seed_everything
 from lifelong_slam.simulation.building_run import BuildingRun
 
+_CELL = 4.0  # metres, as between the vertices that pruning leaves
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -99,18 +101,21 @@ def run_one(job: Job, file: Path) -> None:
         float("inf") if job.budget is None else job.budget,
     )
     truth, table = run.truth[:, :3, 3], []
+    cells = run.cells_entered(_CELL)
     for sample in samples:
         positions = sample.positions
-        table.append(_row(sample, position_rmse(positions, truth[: len(positions)])))
+        ape = position_rmse(positions, truth[: len(positions)])
+        table.append(_row(sample, int(cells[len(positions) - 1]), ape))
     with atomic_path(file.with_suffix(".npy")) as path, path.open("wb") as stream:
         np.save(stream, positions, allow_pickle=False)
     curves = {column: [row[column] for row in table] for column in COLUMNS}
     write_json(file, {"job": asdict(job), "curves": curves})
 
 
-def _row(sample: Sample, ape: float) -> dict[str, float]:
+def _row(sample: Sample, cells: int, ape: float) -> dict[str, float]:
     return {
         "hours": sample.seconds / 3600,
+        "cells": cells,
         "vertices": sample.vertices,
         "edges": sample.edges,
         "back_end_s": sample.back_end_seconds,

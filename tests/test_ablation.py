@@ -91,6 +91,13 @@ def test_samples_come_when_asked_and_at_the_end(run):
     assert seconds[-1] == run.travelled[-1]
 
 
+def test_the_size_of_a_graph_does_not_depend_on_how_many_wait_to_be_settled(run):
+    half = Pruner(Decimate(2), StarMesh())
+    samples = list(drive(run, half, window=20, settle_every=10, sample_every=7))
+    kept = [sample.vertices - 20 for sample in samples[10:]]
+    assert set(np.diff(kept)) == {0, 5}
+
+
 @pytest.mark.slow
 def test_two_methods_leave_their_files_and_a_second_command_repeats_nothing(tmp_path, capsys):
     command = [f"hours={HOURS}", "seeds=1", "methods=none,geometry", "sample_minutes=3"]

@@ -108,6 +108,15 @@ def test_a_keyframe_comes_every_two_metres_or_one_radian(run):
     assert [step.seconds for step in run] == pytest.approx(run.travelled)
 
 
+def test_cells_are_counted_when_they_are_first_entered(run):
+    counts = run.cells_entered(4.0)
+    seen = set()
+    for (x, y), count in zip(run.truth[:300, :2, 3], counts, strict=False):
+        seen.add((x // 4, y // 4))
+        assert count == len(seen)
+    assert len(counts) == len(run)
+
+
 def test_odometry_edges_chain_the_keyframes_and_are_consistent(run):
     steps = list(run)
     edges = [step.odometry for step in steps[1:]]

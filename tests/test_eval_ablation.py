@@ -86,8 +86,11 @@ def test_comparisons_are_made_seed_by_seed():
 
 
 def test_growth_is_that_since_a_fifth_of_the_run():
-    (entry,) = summarise([made_run("none", vertices=[100, 200, 300, 400, 500])])
+    (entry,) = summarise(
+        [made_run("none", vertices=[100, 200, 300, 400, 500], cells=[4, 4, 5, 5, 6])]
+    )
     assert entry["compared"]["vertices"]["mean"] == 5.0
+    assert entry["compared"]["cells"]["mean"] == 1.5
 
 
 def test_fitted_rows_are_marked():

@@ -32,7 +32,7 @@ class Sample:
 
     Attributes:
         seconds: since the start of the run, simulated.
-        vertices: in the graph.
+        vertices: in the graph, without the few that have outgrown the window and wait to be settled.
         edges: in use.
         back_end_seconds: wall time spent on graph, optimisation and pruning so far; NaN where it isn't
             measured any more.
@@ -174,7 +174,7 @@ def drive(
         spent = back_end.spent["optimise"] - optimised
         yield Sample(
             seconds=step.seconds,
-            vertices=len(back_end.graph),
+            vertices=len(back_end.graph) - max(back_end.window - window, 0),
             edges=back_end.graph.edge_count,
             back_end_seconds=back_end.seconds if measured else nan,
             prune_seconds=back_end.spent["prune"],

@@ -101,6 +101,12 @@ class BuildingRun:
             motion = Edge(i - 1, i, self._motions[i - 1], covariance, "odometry") if i else None
             yield Step(i, float(self.travelled[i] / SPEED), T, motion)
 
+    def cells_entered(self, size: float) -> Indices:
+        """Return (N,) how many square cells, `size` metres wide, have been entered by each keyframe."""
+        cells = np.floor(self.truth[:, :2, 3] / size)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        return np.searchsorted(np.sort(first), np.arange(len(self)), side="right")
+
     def loops(self, step: Step, survivors: Indices) -> list[Edge]:
         """Return the loop closure, if any, that a keyframe gives rise to.
 
