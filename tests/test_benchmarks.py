@@ -19,6 +19,7 @@ from lifelong_slam.trajectory import Trajectory
 FOLDER = str(Path(__file__).parents[1] / "benchmarks")
 sys.path.insert(0, FOLDER)
 throughput = importlib.import_module("throughput")
+laps = importlib.import_module("laps")
 campaigns = importlib.import_module("campaigns")
 tables = importlib.import_module("campaign_tables")
 
@@ -107,6 +108,28 @@ def test_throughput_of_a_few_scans(tmp_path, capsys):
 def test_throughput_says_in_one_line_what_is_wrong(capsys):
     assert throughput.main(["--scenario=folder", "scenario.pat=x"]) == 2
     assert "scenario.pat" in capsys.readouterr().err
+
+
+def test_a_slower_machine_is_told_from_a_slower_system():
+    early = [laps.Lap(n, 50.0, 10.0, 500.0, 400.0, 60.0) for n in range(1, 6)]
+    last = laps.Lap(6, 60.0, 12.0, 550.0, 420.0, 61.0)
+    rows = cells_of(laps.growth([*early, last]))
+    assert [row[1:] for row in rows] == [
+        ["3", "1.200"],
+        ["3", "1.000"],
+        ["5", "1.100"],
+        ["5", "1.050"],
+    ]
+    assert cells_of(laps.table([last])) == [["6", "60.0", "12.0", "5.000", "550", "420", "61"]]
+
+
+@pytest.mark.slow
+def test_two_laps_of_coarse_sweeps(tmp_path, capsys):
+    options = ["--laps=2", "--azimuth-step=8", f"scenario.cache_dir={tmp_path}"]
+    assert laps.main(options) == 0
+    out = capsys.readouterr().out
+    assert len(cells_of(out.split("### lifelong\n\n")[1].split("\n\n")[0])) == 2
+    assert "| time by the yardstick |" in out
 
 
 def outcome(scenario, sensor, system, mae, seed=0):

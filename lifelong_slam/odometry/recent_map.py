@@ -6,6 +6,8 @@ import numpy as np
 from kiss_icp.mapping import VoxelHashMap
 from numpy.typing import NDArray
 
+from lifelong_slam.heap import Heap
+
 Array = NDArray[np.float64]
 
 STRETCH = 150.0  # metres; the map holds the points of one to two stretches
@@ -26,6 +28,7 @@ class RecentMap:
             new_map: makes an empty voxel map.
         """
         self._new_map = new_map
+        self._heap = Heap()
         self._younger = new_map()
         self._travelled = 0.0
         self._position: Array | None = None
@@ -40,5 +43,5 @@ class RecentMap:
         if self._travelled >= STRETCH:
             self._travelled = 0.0
             self.current, self._younger = self._younger, self._new_map()
-        self.current.update(points, T_odom_sensor)
-        self._younger.update(points, T_odom_sensor)
+        for voxel_map in (self.current, self._younger):
+            self._heap.call(voxel_map.update, points, T_odom_sensor)

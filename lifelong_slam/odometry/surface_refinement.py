@@ -11,6 +11,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert, log, rotation_angle
+from lifelong_slam.heap import Heap
 from lifelong_slam.registration import Cloud, covariance_of
 
 Array = NDArray[np.float64]
@@ -33,6 +34,7 @@ class SurfaceRefinement:
         """Set up an empty map with cells of `voxel_size` metres."""
         self._voxel_size = voxel_size
         self._map = small_gicp.GaussianVoxelMap(voxel_size)
+        self._heap = Heap()
         self._map.set_lru(horizon=_HORIZON, clear_cycle=_CLEAR_CYCLE)
         self._last_insertion: Array | None = None
         self._usual_move = 0.0  # mean square, m^2
@@ -83,7 +85,7 @@ class SurfaceRefinement:
             near = np.linalg.norm(motion[:3, 3]) < self._voxel_size
             if near and rotation_angle(motion) < _INSERT_ROTATION:
                 return
-        self._map.insert(cloud.points, T_odom_sensor)
+        self._heap.call(self._map.insert, cloud.points, T_odom_sensor)
         self._last_insertion = T_odom_sensor
 
     @property
