@@ -30,7 +30,7 @@ def track_of(poses, every=4, stamps=None):
     return track
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 5, 30])
+@pytest.mark.parametrize("count", [1, 2, 4, 5, 30, 2500])
 def test_the_trajectory_is_odometrys_where_the_graph_agrees(count):
     poses = odometry(count)
     trajectory = track_of(poses).trajectory(poses[::4])
