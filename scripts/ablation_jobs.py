@@ -53,9 +53,12 @@ class Job:
         return out / "runs" / f"{self.method}_wrong{self.wrong:g}_seed{self.seed}.json"
 
     def is_done(self, out: Path) -> bool:
-        """Tell whether a run with these settings has been finished."""
+        """Tell whether a run with these settings has been finished, and left all curves there are now."""
         file = self.file(out)
-        return file.is_file() and json.loads(file.read_text())["job"] == asdict(self)
+        if not file.is_file():
+            return False
+        stored = json.loads(file.read_text())
+        return bool(stored["job"] == asdict(self) and stored["curves"].keys() >= {*COLUMNS})
 
     def result(self, out: Path) -> Run:
         """Read what the finished run left."""

@@ -2,11 +2,15 @@
 
 import csv
 import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from ablate_pruning import main
+from ablation_jobs import Job
+from eval.ablation import COLUMNS
+from eval.files import write_json
 from lifelong_slam.geometry import exp, invert, log
 from lifelong_slam.graph.ablation import BackEnd, drive
 from lifelong_slam.graph.marginalisation import StarMesh
@@ -96,6 +100,18 @@ def test_the_size_of_a_graph_does_not_depend_on_how_many_wait_to_be_settled(run)
     samples = list(drive(run, half, window=20, settle_every=10, sample_every=7))
     kept = [sample.vertices - 20 for sample in samples[10:]]
     assert set(np.diff(kept)) == {0, 5}
+
+
+def test_a_run_without_a_curve_that_is_wanted_now_is_not_done(tmp_path):
+    job = Job("none", {}, 0.0, 0, HOURS, 40, None, 10, 15.0)
+    assert not job.is_done(tmp_path)
+    curves = {column: [1.0] for column in COLUMNS}
+    write_json(job.file(tmp_path), {"job": asdict(job), "curves": curves})
+    assert job.is_done(tmp_path)
+    assert not replace(job, seed=1).is_done(tmp_path)
+    del curves["cells"]
+    write_json(job.file(tmp_path), {"job": asdict(job), "curves": curves})
+    assert not job.is_done(tmp_path)
 
 
 @pytest.mark.slow
