@@ -38,14 +38,13 @@ from itertools import islice
 from pathlib import Path
 from statistics import fmean, median
 
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from lifelong_slam.config import build
 from lifelong_slam.errors import LifelongSlamError
-from lifelong_slam.overrides import check_overrides
+from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything
 from lifelong_slam.result import StageTimes
 from lifelong_slam.scan import Scan
@@ -151,11 +150,7 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
     Raises:
         ConfigError: an override fits no setting.
     """
-    check_overrides(CONF, overrides)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=list(overrides))
-    assert isinstance(config, DictConfig)
-    return config
+    return compose_checked(CONF, overrides)
 
 
 def system_overrides(system: str, threads: int = 0) -> list[str]:

@@ -1,4 +1,4 @@
-"""Finds command line overrides that don't fit the configs, and names the right key or choice."""
+"""Composes configs from command lines, and says which override does not fit and what was meant."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,6 +20,23 @@ from lifelong_slam.config import one_line
 from lifelong_slam.errors import ConfigError, did_you_mean
 
 _HYDRA_VERSION = "1.3"
+
+
+def compose_checked(folder: Path, overrides: Sequence[str], name: str = "config") -> DictConfig:
+    """Return the config that a command line asks for.
+
+    Args:
+        folder: the root of the config groups.
+        overrides: such as ``scenario=A`` or ``seed=1``.
+        name: of the primary config.
+
+    Raises:
+        ConfigError: an override is no setting, or names a choice that isn't there.
+    """
+    check_overrides(folder, overrides, name)
+    with initialize_config_dir(str(folder.resolve()), version_base=_HYDRA_VERSION):
+        config: DictConfig = compose(name, overrides=[*overrides])
+    return config
 
 
 def check_overrides(

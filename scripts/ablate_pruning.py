@@ -48,11 +48,12 @@ from rich.console import Console
 from rich.table import Table
 
 from ablation_jobs import Job, run_all
-from command import compose_config, plain, run_command
+from command import CONF, plain, run_command
 from eval.ablation import LAW, UNPRUNED, Run, rows, summarise
 from eval.ablation_plots import PANELS, overview, save, single
 from eval.files import atomic_path, write_json
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run
 
 _WIDTH = 240  # columns of what is printed, enough for no cell to be cut
@@ -203,7 +204,7 @@ def pruning_config(method: str, seed: int, overrides: tuple[str, ...]) -> dict[s
         f"pruning={method}",
         *(o.replace(method, "pruning", 1) for o in overrides),
     ]
-    return plain(compose_config("config", lines).pruning)
+    return plain(compose_checked(CONF, lines).pruning)
 
 
 def report(plan: Plan, arguments: Sequence[str]) -> list[dict[str, Any]]:

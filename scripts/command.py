@@ -1,4 +1,4 @@
-"""What the commands share: which errors are the user's to mend, exit statuses, composing a config."""
+"""What the commands share: where configs are, which errors are the user's to mend, exit statuses."""
 
 import logging
 import sys
@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -14,7 +13,6 @@ from omegaconf.errors import OmegaConfBaseException
 from console import fail
 from eval.errors import EvalError
 from lifelong_slam.errors import LifelongSlamError
-from lifelong_slam.overrides import check_overrides
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
@@ -51,22 +49,6 @@ def run_command(
         print(when_stopped, file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-def compose_config(name: str, arguments: Sequence[str]) -> DictConfig:
-    """Return the config that a command line asks for.
-
-    Args:
-        name: of the primary config in conf/.
-        arguments: overrides.
-
-    Raises:
-        ConfigError: an argument is no setting, or names a choice that isn't there.
-    """
-    check_overrides(CONF, arguments, name)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config: DictConfig = compose(name, overrides=[*arguments])
-    return config
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -42,7 +42,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from command import compose_config, plain, run_command
+from command import CONF, plain, run_command
 from eval.errors import EvalError
 from eval.evaluation import Verdict, evaluate, make_settings
 from eval.evidence import Evidence
@@ -51,6 +51,7 @@ from eval.numbers import number
 from eval.run import earlier_info, run_files, write_results
 from lifelong_slam.config import check_value
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.overrides import compose_checked
 
 TOPICS = ("topic", "reference_topic")
 ARCHIVE = "evo_ape.zip"
@@ -68,7 +69,7 @@ def judge(arguments: Sequence[str]) -> None:
         ConfigError: an argument is no setting, or there is nothing to judge.
         EvalError: a file is missing or malformed, or the trajectories can't be compared.
     """
-    config = compose_config("evaluate", arguments)
+    config = compose_checked(CONF, arguments, "evaluate")
     settings = make_settings(plain(config.eval))
     run, out = (_path(config, key) for key in ("run", "out"))
     files = given_files(config, EvidenceFiles() if run is None else run_files(run))

@@ -33,7 +33,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from command import compose_config, run_command
+from command import CONF, run_command
 from eval.files import write_json
 from eval.vertices import Array, rmse, vertex_distances
 from lifelong_slam.config import build, check_value
@@ -41,6 +41,7 @@ from lifelong_slam.errors import ConfigError
 from lifelong_slam.graph.reduction import Reduction, State, reduce
 from lifelong_slam.io.g2o import read_g2o, write_g2o
 from lifelong_slam.io.graph_truth import read_truth
+from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything
 
 
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def work(arguments: Sequence[str]) -> None:
     """Do what the command line says, and show what it changes."""
-    config = compose_config("prune", arguments)
+    config = compose_checked(CONF, arguments, "prune")
     show(prune(parse(config), config, arguments))
 
 
