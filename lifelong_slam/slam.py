@@ -109,13 +109,17 @@ class LifelongSlam:
         self._keyframes = dict(saved.keyframes)
         self._graph.restore(saved.poses, saved.edges, saved.rejected)
         self._static_map.restore(saved.voxels())
-        self._loop_closer.places.restore(saved.places, saved.keyframe_poses(), saved.hosts())
+        keyframe_poses, hosts = saved.keyframe_poses(), saved.hosts()
+        self._loop_closer.places.restore(saved.places, keyframe_poses, hosts)
         if session.localize:
             self._map_points = self._static_map.points(saved.poses)
             self._pruning = Pruner(Everything(), StarMesh())
             return
         unsettled = [i for i, keyframe in saved.keyframes.items() if len(keyframe.points)]
-        self._pruning.adopt(self._keyframes.keys() - set(unsettled))
+        for root in self._graph.roots:
+            component = self._graph.component(root)
+            hung = {i: host for i, host in hosts.items() if host in component}
+            self._pruning.adopt(component - set(unsettled), keyframe_poses, hung)
         self._window = unsettled  # a session that was cut off
         self._graph.optimise()
         self._settle(len(unsettled))

@@ -5,15 +5,19 @@ geometry and marginalised. The newest are left alone until loop closures have ha
 after that each is settled: it goes, or it stays as long as the optimiser keeps it away from others.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Protocol
 
 import networkx
+import numpy as np
+from numpy.typing import NDArray
 
 from lifelong_slam.graph.marginalisation import Marginalisation
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.removal import Removal, removal_of
 from lifelong_slam.graph.selection import Selection
+
+Array = NDArray[np.float64]
 
 
 class Pruning(Protocol):
@@ -34,8 +38,17 @@ class Pruning(Protocol):
         """
         ...
 
-    def adopt(self, vertices: Collection[int]) -> None:
-        """Take over vertices that were settled, and stayed, in earlier sessions."""
+    def adopt(
+        self, vertices: Collection[int], poses: Mapping[int, Array], hosts: Mapping[int, int]
+    ) -> None:
+        """Take over what was settled in earlier sessions.
+
+        Args:
+            vertices: those that stayed, of one component.
+            poses: (4, 4) T_map_vertex of all that there have ever been.
+            hosts: the vertex that each of them is or hangs on, of those that are still there in
+                this component.
+        """
         ...
 
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
@@ -52,7 +65,9 @@ class NoPruning:
         """Remove nothing."""
         return []
 
-    def adopt(self, vertices: Collection[int]) -> None:
+    def adopt(
+        self, vertices: Collection[int], poses: Mapping[int, Array], hosts: Mapping[int, int]
+    ) -> None:
         """Do nothing."""
 
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
@@ -87,9 +102,12 @@ class Pruner:
         self._kept = (self._kept | set(vertices)) - set(removed)
         return self._remove(graph, removed, self._kept)
 
-    def adopt(self, vertices: Collection[int]) -> None:
+    def adopt(
+        self, vertices: Collection[int], poses: Mapping[int, Array], hosts: Mapping[int, int]
+    ) -> None:
         """Count vertices among those that stayed before. See Pruning."""
         self._kept |= set(vertices)
+        self._selection.adopt(poses, hosts)
 
     def reduce(self, graph: PoseGraph, keep: int) -> list[Removal]:
         """Remove down to a number of vertices. See Pruning."""

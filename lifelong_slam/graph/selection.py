@@ -8,9 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from lifelong_slam.graph.trail import Trail
+
 Array = NDArray[np.float64]
 
 _REACH = 3.0  # spacings up to which others count towards a vertex's density
+_GRAIN = 0.25  # spacings between the spots of the trail
+_HASTE = 1.1  # times as dense an older vertex must be to go before a new one
 
 
 class Selection(Protocol):
@@ -37,58 +41,78 @@ class Selection(Protocol):
         """Choose, once and for all, `count` of the removable vertices, or fewer if they run out."""
         ...
 
+    def adopt(self, poses: Mapping[int, Array], hosts: Mapping[int, int]) -> None:
+        """Take over what was settled in earlier sessions; most selections needn't know.
 
-class Geometry:
+        Args:
+            poses: (4, 4) T_map_vertex of all vertices that there have ever been.
+            hosts: the vertex that each of them is or hangs on, of those that are still there; of
+                one component.
+        """
+        return
+
+
+class Geometry(Selection):
     """The densest go first, so that those that stay are spread evenly (Kurz, Holoch and Biber 2021).
 
     The density of a vertex is scale-invariant, SID(i) = sum over j of 1 / |x_i - x_j|, over the
     others within three spacings: further away the sum tells how near a vertex is to the map's centre.
     With a sensor that doesn't see all around, two vertices in one place that look different ways are
     different views: x has the position and, to scale, the direction of view.
+
+    Those that stay cover the trail, all spots where vertices have ever been: each spot has one of them
+    within the spacing, and none of them could go without leaving a spot bare.
     """
 
     def __init__(self, spacing: float, field_of_view: float = 360.0) -> None:
         """Set up.
 
         Args:
-            spacing: metres between vertices that stay; each removed one has a neighbour that near.
+            spacing: metres within which each spot of the trail has a vertex.
             field_of_view: horizontal, degrees; vertices that look half of it apart count as one
                 spacing apart.
         """
         self._spacing = spacing
         half = np.radians(field_of_view) / 2
         self._view_radius = 0.0 if field_of_view >= 360 else spacing / (2 * np.sin(half / 2))
+        self._trail = Trail(self._places, _GRAIN * spacing)
 
     def settle(
         self, poses: Mapping[int, Array], new: Collection[int], older: Collection[int]
     ) -> list[int]:
-        """Remove the densest while they have a neighbour within the spacing; see Selection.
+        """Remove the densest while the others still cover the trail; see Selection."""
+        if not poses:
+            return []
+        ids, T = np.array(list(poses)), np.array(list(poses.values()))
+        self._trail.extend(ids, T)
+        cover = _Cover(self._places(T), self._trail.places(ids, T), self._spacing)
+        density = _Density(self._places(T), _REACH * self._spacing)
+        factors = dict.fromkeys(older, 1.0) | dict.fromkeys(new, _HASTE)
+        haste = np.array([factors.get(vertex, 0.0) for vertex in poses])
+        removed = density.thin(haste, cover)
+        self._trail.rehome(ids, T, removed)
+        return [int(i) for i in ids[removed]]
 
-        One that was kept goes only if the optimiser moved it within half the spacing of another.
-        """
-        ids = list(poses)
-        limits = dict.fromkeys(older, self._spacing / 2) | dict.fromkeys(new, self._spacing)
-        limit = np.array([limits.get(vertex, 0.0) for vertex in ids])
-        density = _Density(self._places(poses), _REACH * self._spacing)
-        return [ids[i] for i in density.thin(limit)]
+    def adopt(self, poses: Mapping[int, Array], hosts: Mapping[int, int]) -> None:
+        """Take over the trail of earlier sessions; see Selection."""
+        self._trail.adopt(poses, hosts)
 
     def reduce(
         self, poses: Mapping[int, Array], removable: Collection[int], count: int
     ) -> list[int]:
         """Remove the densest first; see Selection."""
         ids = np.array(list(poses))
-        places = self._places(poses)
+        places = self._places(np.array(list(poses.values())).reshape(-1, 4, 4))
         # The spacing that the others end up with: to the nearest of as many as one has to stand for.
         share = int(np.ceil(len(ids) / max(len(ids) - count, 1)))
         neighbours = min(share + 1, len(ids))
         spacing = float(np.median(cKDTree(places).query(places, k=[neighbours])[0]))
         density = _Density(places, _REACH * max(spacing, 1e-6))
-        limit = np.where(np.isin(ids, list(removable)), np.inf, 0.0)
-        return [int(ids[i]) for i in density.thin(limit, count)]
+        free = np.isin(ids, list(removable)).astype(float)
+        return [int(ids[i]) for i in density.thin(free, None, count)]
 
-    def _places(self, poses: Mapping[int, Array]) -> Array:
-        """Return (n, 6) positions and scaled directions of view."""
-        T = np.array(list(poses.values())).reshape(-1, 4, 4)
+    def _places(self, T: Array) -> Array:
+        """Return (n, 6) positions and scaled directions of view of (n, 4, 4) poses."""
         return np.concatenate([T[:, :3, 3], self._view_radius * T[:, :3, 0]], axis=1)
 
 
@@ -106,39 +130,47 @@ class _Density:
         self._ends = np.searchsorted(row[order], np.arange(len(places) + 1))
         self._neighbours, self._distances = column[order], distance[order]
         self._values = np.bincount(row, 1 / distance, minlength=len(places))
-        self._alive = np.ones(len(places), dtype=bool)
 
-    def thin(self, limit: Array, count: int | None = None) -> list[int]:
-        """Take away the densest points that have another one nearer than their limit.
+    def thin(self, haste: Array, cover: "_Cover | None", count: int | None = None) -> list[int]:
+        """Take away the densest points without which the others still cover all spots.
 
         Args:
-            limit: (n,) metres; zero protects a point.
+            haste: (n,) factor of a point's density; zero protects it.
+            cover: of the points; None if nothing has to be covered.
             count: how many to take away at most.
         """
-        candidates = limit > 0
+        candidates = haste > 0
         removed: list[int] = []
         while candidates.any() and (count is None or len(removed) < count):
-            densest = int(np.argmax(np.where(candidates, self._values, -1.0)))
-            candidates[densest] = False  # either goes or, as it can only get sparser, stays
-            if np.isinf(limit[densest]) or self._nearest(densest) < limit[densest]:
+            densest = int(np.argmax(np.where(candidates, haste * self._values, -1.0)))
+            candidates[densest] = False  # either goes or, as fewer and fewer cover a spot, stays
+            if cover is None or cover.spares(densest):
                 self._take(densest)
                 removed.append(densest)
         return removed
 
-    def _nearest(self, i: int) -> float:
-        """Return the distance to the nearest point that is still there."""
-        span = slice(self._ends[i], self._ends[i + 1])
-        distances = self._distances[span][self._alive[self._neighbours[span]]]
-        return float(distances.min()) if len(distances) else np.inf
-
     def _take(self, i: int) -> None:
         span = slice(self._ends[i], self._ends[i + 1])
-        self._alive[i] = False
         np.subtract.at(self._values, self._neighbours[span], 1 / self._distances[span])
 
 
+class _Cover:
+    """How many points each spot has within reach, kept up to date while they are taken away."""
+
+    def __init__(self, places: Array, spots: Array, reach: float) -> None:
+        near = cKDTree(spots).query_ball_point(places, reach)
+        self._near = [np.array(spots, dtype=np.int64) for spots in near]
+        self._counts = np.bincount(np.concatenate(self._near), minlength=len(spots))
+
+    def spares(self, i: int) -> bool:
+        """Tell whether every spot near point i has another one, and take the point away if so."""
+        spares = bool((self._counts[self._near[i]] > 1).all())
+        self._counts[self._near[i]] -= spares
+        return spares
+
+
 @dataclass(frozen=True, slots=True)
-class Decimate:
+class Decimate(Selection):
     """Every k-th vertex in time stays.
 
     Attributes:
@@ -163,7 +195,7 @@ class Decimate:
         return [int(i) for i in np.delete(ids, staying)]
 
 
-class Everything:
+class Everything(Selection):
     """No vertex stays: for a visitor who only asks where he is."""
 
     def settle(
@@ -179,7 +211,7 @@ class Everything:
         return sorted(removable)[:count]
 
 
-class Random:
+class Random(Selection):
     """Any vertex goes as likely as any other."""
 
     def __init__(self, keep: float = 1 / 3, seed: int = 0) -> None:
