@@ -9,11 +9,10 @@ six-dimensional covariance averages 6, with a median of 5.3.
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
+from throughput import compose_config
 
 from lifelong_slam.config import build
 from lifelong_slam.geometry import invert, log
@@ -22,7 +21,6 @@ from lifelong_slam.mapping.keyframe import KeyframeSelector
 from lifelong_slam.odometry.odometry import OdometryEstimate
 
 Array = NDArray[np.float64]
-CONF = Path(__file__).resolve().parent.parent / "conf"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +39,7 @@ class EdgeErrors:
 
 def measure(scenario: str, sensor: str) -> EdgeErrors:
     """Run the front end on a campaign and compare its keyframe edges with the truth."""
-    config = compose("config", overrides=[f"scenario={scenario}", f"sensor={sensor}"])
+    config = compose_config([f"scenario={scenario}", f"sensor={sensor}"])
     source = build(config.scenario)
     odometry = build(config.odometry)
     selector = KeyframeSelector(config.system.keyframe_distance, config.system.keyframe_rotation)
@@ -74,10 +72,9 @@ def main() -> None:
         "| scenario | sensor | edges | error mm | predicted | error mrad | predicted | NEES mean | median |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for scenario in arguments.scenarios.split(","):
-            for sensor in arguments.sensors.split(","):
-                print(_row(scenario, sensor, measure(scenario, sensor)), flush=True)
+    for scenario in arguments.scenarios.split(","):
+        for sensor in arguments.sensors.split(","):
+            print(_row(scenario, sensor, measure(scenario, sensor)), flush=True)
 
 
 def _row(scenario: str, sensor: str, edges: EdgeErrors) -> str:

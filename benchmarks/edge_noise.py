@@ -8,12 +8,10 @@ noise of the graph-level simulation (`lifelong_slam/simulation/building_run.py`)
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
-from throughput import markdown
+from throughput import compose_config, markdown
 
 from lifelong_slam.config import build
 from lifelong_slam.geometry import invert, log
@@ -22,14 +20,12 @@ from lifelong_slam.result import EdgeKind
 from lifelong_slam.sources.cleaning import InputCounts, clean
 
 Array = NDArray[np.float64]
-CONF = Path(__file__).resolve().parent.parent / "conf"
 DEFAULTS = ("scenario=loop", "scenario.laps=2", "sensor=vls128", "pruning=none")
 
 
 def measure(overrides: Sequence[str]) -> dict[EdgeKind, Array]:
     """Return (N, 6) errors of the edges of each kind, in the target's frame, rotation then translation."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", overrides=[*DEFAULTS, *overrides])
+    config = compose_config([*DEFAULTS, *overrides])
     seed_everything(config.seed)
     system, source = build(config.system), build(config.scenario)
     vertices = np.array([system.process(scan).vertices for scan in clean(source, InputCounts())])

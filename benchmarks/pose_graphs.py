@@ -22,7 +22,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
 from throughput import facts, markdown
 
 from eval.files import atomic_path, write_json
@@ -32,6 +31,7 @@ from lifelong_slam.graph.pruning import NoPruning, Pruning
 from lifelong_slam.graph.reduction import Reduction, reduce
 from lifelong_slam.io.g2o import FileGraph, read_g2o
 from lifelong_slam.io.graph_truth import read_truth
+from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
@@ -155,13 +155,12 @@ def read(folder: Path, name: str) -> tuple[FileGraph, dict[int, Array] | None]:
 
 def prunings(methods: Sequence[str], seeds: Sequence[int]) -> Iterator[tuple[str, Pruning]]:
     """Yield the methods by name, and `random` once for each seed."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for method in methods:
-            for seed in seeds if method == "random" else seeds[:1]:
-                seed_everything(seed)
-                lines = ["graph=", f"pruning={method}", f"seed={seed}"]
-                name = f"{method} {seed}" if method == "random" else method
-                yield name, build(compose("prune", overrides=lines).pruning)
+    for method in methods:
+        for seed in seeds if method == "random" else seeds[:1]:
+            seed_everything(seed)
+            lines = ["graph=", f"pruning={method}", f"seed={seed}"]
+            name = f"{method} {seed}" if method == "random" else method
+            yield name, build(compose_checked(CONF, lines, "prune").pruning)
 
 
 def whole(name: str, result: Reduction, truth: dict[int, Array] | None, planar: bool) -> Whole:

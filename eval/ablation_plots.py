@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from eval.ablation import Run, grouped
@@ -32,7 +33,7 @@ class Panel:
         column: of the curves.
         title: of the picture.
         unit: of its vertical axis.
-        logarithmic: whether that axis is.
+        logarithmic: whether that axis is, where the curves span a decade.
         scale: factor from the curve to the unit.
     """
 
@@ -95,8 +96,12 @@ def _draw(axes: Axes, runs: Sequence[Run], panel: Panel) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlim(left=0)
-    if panel.logarithmic:
+    low, high = axes.dataLim.intervaly
+    if panel.logarithmic and high > 10 * low:
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     else:
         axes.set_ylim(bottom=0)
 
