@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
-from pose_graph_support import IN_PLANE, gtsam_optimum, laps
+from g2o_support import IN_PLANE, gtsam_optimum, laps
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.geometry import exp, log

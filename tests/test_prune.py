@@ -7,7 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from pose_graph_support import gtsam_optimum, laps
+from g2o_support import gtsam_optimum, laps
 
 import prune
 from eval.vertices import rmse, vertex_distances
