@@ -13,6 +13,8 @@ from run_support import START, ListSource, arc, write_folder
 
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.geometry import exp
+from lifelong_slam.graph.marginalisation import StarMesh
+from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.result import Edge, GraphSnapshot, SlamResult
 from lifelong_slam.trajectory import Trajectory
 
@@ -22,6 +24,7 @@ throughput = importlib.import_module("throughput")
 laps = importlib.import_module("laps")
 campaigns = importlib.import_module("campaigns")
 tables = importlib.import_module("campaign_tables")
+factor_recovery = importlib.import_module("factor_recovery")
 
 needs_kiss_slam = pytest.mark.skipif(
     importlib.util.find_spec("kiss_slam") is None,
@@ -249,3 +252,53 @@ def test_campaigns_of_a_few_scans(tmp_path, capsys):
     (same,) = json.loads((out / "campaigns.json").read_text())["cells"]
     assert row["mae_m"] == str(same["mae_m"])
     assert int(row["scans"]) == 10
+
+
+# Factor recovery.
+
+
+def star_of(count, seed=0):
+    """Return a vertex among others, with measurements of unlike covariances to all of them."""
+    rng = np.random.default_rng(seed)
+    graph = PoseGraph()
+    graph.add_vertex(0, np.eye(4))
+    hub = exp(rng.normal(size=6))
+    for i in range(count):
+        A = rng.normal(size=(6, 6)) * 0.1
+        covariance = (A @ A.T + 0.01 * np.eye(6)) * 0.01
+        motion = hub if i == 0 else exp(rng.normal(size=6))
+        ends = (0, 100) if i == 0 else (100, i)
+        graph.add_odometry(Edge(*ends, motion, covariance, "odometry"))
+    return factor_recovery.Star(graph, 100, set(range(count)))
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_the_best_edges_between_the_same_pairs_lose_no_more_than_the_mesh(count):
+    mesh, recovered, tree = factor_recovery.compare(star_of(count))
+    assert -1e-9 < recovered.divergence <= mesh.divergence + 1e-9
+    assert recovered.divergence <= tree.divergence + 1e-9
+    if count == 2:  # one edge is all there is to say
+        assert max(one.divergence for one in (mesh, recovered, tree)) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_other_edges_between_the_pairs_are_better_than_those_recovered(seed):
+    """Karush, Kuhn and Tucker: the slope vanishes where there is information, and rises elsewhere."""
+    star = star_of(5, seed)
+    edges = star.left_by(StarMesh())
+    best, exact = star.recovered(edges), np.linalg.inv(star.exact)
+    assert np.trace(best @ exact) == pytest.approx(len(exact), rel=1e-4)
+    for edge in edges:
+        J = star._jacobian(edge)
+        wanted = J @ exact @ J.T
+        slope = wanted - J @ np.linalg.solve(best, J.T)
+        assert np.linalg.eigvalsh(slope)[0] > -1e-3 * np.linalg.eigvalsh(wanted)[-1]
+
+
+def test_factor_recovery_prints_a_row_for_each_method(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["factor_recovery.py", "--hours", "0.1", "--every", "20"])
+    factor_recovery.main()
+    rows = cells_of(capsys.readouterr().out.split("unknown")[-1].split("|", 1)[1])
+    methods = [row[2] for row in rows if len(row) == 8]
+    assert methods
+    assert set(methods) == {"mesh", "recovered", "tree"}
