@@ -85,8 +85,9 @@ class Geometry(Selection):
             return []
         ids, T = np.array(list(poses)), np.array(list(poses.values()))
         self._trail.extend(ids, T)
-        cover = _Cover(self._places(T), self._trail.places(ids, T), self._spacing)
-        density = _Density(self._places(T), _REACH * self._spacing)
+        places = self._places(T)
+        cover = _Cover(places, self._trail.places(ids, T), self._spacing)
+        density = _Density(places, _REACH * self._spacing)
         factors = dict.fromkeys(older, 1.0) | dict.fromkeys(new, _HASTE)
         haste = np.array([factors.get(vertex, 0.0) for vertex in poses])
         removed = density.thin(haste, cover)
@@ -144,7 +145,7 @@ class _Density:
         while candidates.any() and (count is None or len(removed) < count):
             densest = int(np.argmax(np.where(candidates, haste * self._values, -1.0)))
             candidates[densest] = False  # either goes or, as fewer and fewer cover a spot, stays
-            if cover is None or cover.spares(densest):
+            if cover is None or cover.release(densest):
                 self._take(densest)
                 removed.append(densest)
         return removed
@@ -162,11 +163,11 @@ class _Cover:
         self._near = [np.array(spots, dtype=np.int64) for spots in near]
         self._counts = np.bincount(np.concatenate(self._near), minlength=len(spots))
 
-    def spares(self, i: int) -> bool:
-        """Tell whether every spot near point i has another one, and take the point away if so."""
-        spares = bool((self._counts[self._near[i]] > 1).all())
-        self._counts[self._near[i]] -= spares
-        return spares
+    def release(self, i: int) -> bool:
+        """Take point i away if every spot near it has another one; tell whether that was so."""
+        is_spare = bool((self._counts[self._near[i]] > 1).all())
+        self._counts[self._near[i]] -= is_spare
+        return is_spare
 
 
 @dataclass(frozen=True, slots=True)
