@@ -2,7 +2,7 @@
 
 Kurz, Holoch and Biber, *Geometry-based graph pruning for lifelong SLAM* (IROS 2021): vertices are chosen by
 geometry and marginalised. The newest are left alone until loop closures have had their say about them;
-after that each is settled: it goes, or it stays as long as the optimiser keeps it away from others.
+after that each is settled: it goes, or it stays until others make up for it.
 """
 
 from collections.abc import Collection, Mapping
