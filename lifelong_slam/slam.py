@@ -249,8 +249,8 @@ class LifelongSlam:
         if self._map_points is None:
             for vertex in removed:
                 self._static_map.rehome(vertex, {vertex: poses[vertex], **lasting})
-            for vertex in leaving:
-                self._static_map.settle(self._keyframes[vertex], poses[vertex], lasting)
+            keyframes = [self._keyframes[vertex] for vertex in leaving]
+            self._static_map.settle(keyframes, [poses[vertex] for vertex in leaving], lasting)
         for vertex in leaving:
             self._keyframes[vertex] = replace(self._keyframes[vertex], points=_NO_POINTS)
         self._loop_closer.places.rehome(removed, poses, lasting)

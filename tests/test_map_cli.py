@@ -84,7 +84,8 @@ def drive_along(store, session, first, count):
             )
         )
         if i < count // 2:
-            static_map.settle(keyframe, pose, {v: poses[v] for v in range(first, vertex + 1)})
+            owners = {v: poses[v] for v in range(first, vertex + 1)}
+            static_map.settle([keyframe], [pose], owners)
             arrays = {v: static_map.submaps[v].arrays() for v in static_map.take_changed()}
             store.write(MapUpdate(settled=[vertex], submaps=arrays))
 

@@ -56,20 +56,22 @@ def without_looks(monkeypatch):
     monkeypatch.setattr(View, "looks_through", lambda self, points: np.zeros(len(points), bool))
 
 
-def settled(keyframes, poses, owners, static_map=None):
+def settled(keyframes, poses, owners, static_map=None, at_a_time=1):
     static_map = static_map or StaticMap(VOXEL)
-    for one, pose in zip(keyframes, poses, strict=True):
-        static_map.settle(one, pose, owners)
+    for i in range(0, len(keyframes), at_a_time):
+        group = slice(i, i + at_a_time)
+        static_map.settle(keyframes[group], poses[group], owners)
     return static_map
 
 
-def built_from(keyframes, poses, static_map=None):
+def built_from(keyframes, poses, static_map=None, at_a_time=1):
     """Return the points of a map whose owners are 5 m apart."""
     owners = {}
     for i, pose in enumerate(poses):
         if all(np.linalg.norm(T[:3, 3] - pose[:3, 3]) >= 5.0 for T in owners.values()):
             owners[i] = pose
-    return settled(keyframes, poses, owners, static_map or StaticMap(0.2)).points(owners)
+    static_map = static_map or StaticMap(0.2)
+    return settled(keyframes, poses, owners, static_map, at_a_time).points(owners)
 
 
 def test_a_maps_points_are_the_means_of_what_was_measured_in_each_voxel(monkeypatch):
@@ -92,6 +94,20 @@ def test_the_order_of_hits_changes_nothing(monkeypatch):
     owners = {0: planar(-4, 0), 1: planar(4, 1, 0.5)}
     there, back = (settled(keyframes[::s], poses[::s], owners).points(owners) for s in (1, -1))
     np.testing.assert_allclose(there, back, atol=1e-5)
+
+
+@pytest.mark.parametrize("at_a_time", [2, 3, 7])
+def test_keyframes_may_be_settled_one_by_one_or_together(monkeypatch, at_a_time):
+    without_looks(monkeypatch)
+    keyframes, poses = clutter(4, 7)
+    owners = {0: planar(-4, 0), 1: planar(4, 1, 0.5)}
+    apart, together = (settled(keyframes, poses, owners, at_a_time=n) for n in (1, at_a_time))
+    for owner in owners:
+        one, other = apart.submaps[owner], together.submaps[owner]
+        np.testing.assert_array_equal(one.keys, other.keys)
+        np.testing.assert_array_equal(one.weights, other.weights)
+        np.testing.assert_array_equal(one.scores, other.scores)
+        np.testing.assert_allclose(one.means, other.means, atol=1e-5)
 
 
 def test_a_keyframe_counts_once_for_a_voxel_however_many_points_it_has_there():
@@ -135,7 +151,7 @@ def test_owners_that_changed_are_told_once():
     static_map = settled([near], [np.eye(4)], owners)
     assert static_map.take_changed() == {4}
     assert static_map.take_changed() == set()
-    static_map.settle(near, planar(40, 0), owners)
+    static_map.settle([near], [planar(40, 0)], owners)
     assert static_map.take_changed() == {9}
     static_map.rehome(9, owners)
     assert static_map.take_changed() == {4}
@@ -256,23 +272,25 @@ def in_lane(points):
     return points[(points[:, 2] > 0.4) & (points[:, 2] < 1.7) & (np.abs(points[:, 1] - 3) < 1.3)]
 
 
-def test_what_moves_leaves_no_trail(oncoming_car, empty_street):
+@pytest.mark.parametrize("at_a_time", [1, 6, 20])
+def test_what_moves_leaves_no_trail(oncoming_car, empty_street, at_a_time):
     assert len(in_lane(measured(*oncoming_car))) > 300
-    assert len(in_lane(built_from(*oncoming_car))) == 0
-    assert len(in_lane(built_from(*empty_street))) == 0
+    assert len(in_lane(built_from(*oncoming_car, at_a_time=at_a_time))) == 0
+    assert len(in_lane(built_from(*empty_street, at_a_time=at_a_time))) == 0
 
 
-def test_what_stands_remains(empty_street, parked_car):
+@pytest.mark.parametrize("at_a_time", [1, 6, 20])
+def test_what_stands_remains(empty_street, parked_car, at_a_time):
     keyframes, poses = empty_street
-    static_map = settled(keyframes, poses, HOME, StaticMap(0.2))
+    static_map = settled(keyframes, poses, HOME, StaticMap(0.2), at_a_time)
     submap = static_map.submaps[0]
     assert submap.static.mean() > 0.995
     x, y, z = submap.means.T
     poles = (np.abs(y - 5) < 0.3) & (z > 0.4) & (np.abs(x - 10) < 6)
     assert poles.sum() > 100
     assert submap.static[poles].mean() > 0.98  # though they are thinner than a pixel
-    stands = in_lane(settled(*parked_car, HOME, StaticMap(0.2)).submaps[0].means)
-    kept = in_lane(settled(*parked_car, HOME, StaticMap(0.2)).points(HOME))
+    with_car = settled(*parked_car, HOME, StaticMap(0.2), at_a_time)
+    stands, kept = in_lane(with_car.submaps[0].means), in_lane(with_car.points(HOME))
     assert len(kept) > 0.98 * len(stands) > 100
 
 
@@ -292,11 +310,19 @@ def test_the_same_keyframes_give_the_same_map(oncoming_car):
     np.testing.assert_array_equal(maps[0], maps[1])
 
 
+def test_what_came_and_left_among_keyframes_settled_together_does_not_enter():
+    (full, T), (free, _) = standing_before(12.0), standing_before(None)
+    visits = [free] * 3 + [full] * 3 + [free] * 14
+    static_map = settled(visits, [T] * 20, HOME, StaticMap(0.2), at_a_time=20)
+    stood = settled([free] * 3 + [full] * 17, [T] * 20, HOME, StaticMap(0.2), at_a_time=20)
+    assert len(in_lane(static_map.points(HOME))) < 0.02 * len(in_lane(stood.points(HOME)))
+
+
 def test_what_passes_where_others_looked_through_before_does_not_enter(empty_street, parked_car):
     static_map = settled(*empty_street, HOME, StaticMap(0.2))
     glimpse, T = parked_car[0][-1], parked_car[1][-1]
     assert len(in_lane(transform(T, glimpse.points.astype(float)))) > 10
-    static_map.settle(glimpse, T, HOME)
+    static_map.settle([glimpse], [T], HOME)
     assert len(in_lane(static_map.points(HOME))) == 0
 
 

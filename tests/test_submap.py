@@ -71,10 +71,29 @@ def test_after_an_absence_what_is_gone_leaves_after_three_looks_and_what_stands_
     assert submap.scores.tolist() == [DOUBTED, DOUBTED, -1]
     for _ in range(DOUBTED + 1):
         assert submap.static[1]
-        submap.weaken(np.array([1]))
+        submap.weaken(np.array([0, 1, 0])[: len(submap)])
         submap.merge(*voxels([[0.1, 0.1, 0.1]]))
     assert submap.static.tolist() == [True, False, False]
     assert submap.scores[0] == DOUBTED + 3
+
+
+def test_looks_count_alike_together_and_one_after_the_other():
+    together, apart = Submap.empty(), Submap.empty()
+    rng = np.random.default_rng(3)
+    points = np.arange(30)[:, None] * [1.0, 0.0, 0.0] + 0.1
+    for submap in (together, apart):
+        submap.merge(*voxels(points, score=3))
+    looks = rng.integers(0, 9, 30)
+    together.weaken(looks)
+    left = looks.copy()
+    while left.any():
+        once = np.minimum(left, 1)
+        before = apart.keys
+        apart.weaken(once)
+        left = (left - once)[np.isin(before, apart.keys)]
+    assert 0 < len(together) < 30
+    for name, array in together.arrays().items():
+        np.testing.assert_array_equal(array, apart.arrays()[name])
 
 
 def test_what_stood_for_years_leaves_the_map_like_what_stood_for_a_day():
@@ -82,9 +101,8 @@ def test_what_stood_for_years_leaves_the_map_like_what_stood_for_a_day():
     for _ in range(1000):
         submap.merge(*voxels([[0.1, 0.1, 0.1], [2.1, 0.1, 0.1]]))
     assert submap.scores.tolist() == [HIGH, HIGH]
-    gone = np.array([1])
-    for _ in range(HIGH):
-        submap.weaken(gone)
+    gone = np.array([0, 1])
+    submap.weaken(HIGH * gone)
     assert submap.static.tolist() == [True, True]
     submap.weaken(gone)
     assert submap.static.tolist() == [True, False]

@@ -54,9 +54,8 @@ def static_points(saved: SavedMap) -> NDArray[np.float32]:
     static_map = StaticMap(saved.info.voxel_size)
     static_map.restore(saved.voxels())
     poses = {i: saved.poses[i] for i in saved.keyframes}
-    for i, keyframe in saved.keyframes.items():
-        if len(keyframe.points):
-            static_map.settle(keyframe, poses[i], poses)
+    unsettled = {i: k for i, k in saved.keyframes.items() if len(k.points)}
+    static_map.settle(list(unsettled.values()), [poses[i] for i in unsettled], poses)
     return points_to_base(static_map.points(poses), saved.info.T_base_sensor)
 
 

@@ -6,8 +6,7 @@ against those that it looked through (the idea of Removert: Kim and Kim, IROS 20
 both decides (see `Submap`).
 """
 
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,7 @@ Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _STRIDE = 2  # every second keyframe looks; a moving thing is passed by more than one
-_LOOKS_BACK = 15  # views that new voxels are held against
+_LOOKS_BACK = 15  # views before those at hand that new voxels are held against too
 _BLOCK = 2.0  # metres; what goes to one owner
 
 
@@ -49,7 +48,7 @@ class StaticMap:
         self.max_range = max_range
         self._submaps: dict[int, Submap] = {}
         self._changed: set[int] = set()
-        self._views: deque[View] = deque(maxlen=_LOOKS_BACK)
+        self._views: list[View] = []
         self._settled = 0
 
     @property
@@ -74,21 +73,26 @@ class StaticMap:
         changed, self._changed = self._changed, set()
         return changed
 
-    def settle(self, keyframe: Keyframe, T_map_keyframe: Array, poses: Mapping[int, Array]) -> None:
-        """Take in what a keyframe saw, once loop closures have had their say on where it was.
+    def settle(
+        self,
+        keyframes: Sequence[Keyframe],
+        T_map_keyframes: Sequence[Array],
+        poses: Mapping[int, Array],
+    ) -> None:
+        """Take in what keyframes saw, once loop closures have had their say on where they were.
 
         Args:
-            keyframe: to take in; later than those before it, and its odometry continuous with theirs.
-            T_map_keyframe: (4, 4).
+            keyframes: to take in, in their order; later than those before them, and their odometry
+                continuous with theirs.
+            T_map_keyframes: (4, 4) each.
             poses: (4, 4) T_map_vertex of all vertices that may own voxels; at least one.
         """
+        if not keyframes:
+            return
         owners = _Owners(poses)
-        if self._settled % _STRIDE == 0:
-            view = View.of(keyframe.points, keyframe.T_odom_sensor)
-            self._look(view, T_map_keyframe, owners)
-            self._views.append(view)
-        self._settled += 1
-        self._hit(keyframe, T_map_keyframe, owners)
+        self._look(keyframes, T_map_keyframes, owners)
+        self._hit(keyframes, T_map_keyframes, owners)
+        del self._views[:-_LOOKS_BACK]
 
     def rehome(self, vertex: int, poses: Mapping[int, Array]) -> None:
         """Hand the voxels of a vertex that is about to be removed to the nearest of the others.
@@ -133,8 +137,26 @@ class StaticMap:
         self._changed.add(owner)
         return self._submaps.setdefault(owner, Submap.empty())
 
-    def _look(self, view: View, T_map_sensor: Array, owners: "_Owners") -> None:
-        """Count a view against the voxels that it looked through."""
+    def _look(
+        self, keyframes: Sequence[Keyframe], T_map_keyframes: Sequence[Array], owners: "_Owners"
+    ) -> None:
+        """Count keyframes against the voxels that they looked through, and remember their views."""
+        first = -self._settled % _STRIDE
+        self._settled += len(keyframes)
+        views = [View.of(k.points, k.T_odom_sensor) for k in keyframes[first::_STRIDE]]
+        looks: dict[int, NDArray[np.int64]] = {}
+        for view, T_map_sensor in zip(views, T_map_keyframes[first::_STRIDE], strict=True):
+            for owner, voxels in self._looked_through(view, T_map_sensor, owners):
+                count = looks.setdefault(owner, np.zeros(len(self._submaps[owner]), np.int64))
+                count[voxels] += 1
+        for owner, count in looks.items():
+            self._submap(owner).weaken(count)
+        self._views += views
+
+    def _looked_through(
+        self, view: View, T_map_sensor: Array, owners: "_Owners"
+    ) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Yield owners, and the indices of their voxels that a view looked through."""
         seen = list(self._in_sight(T_map_sensor, owners))
         if not seen:
             return
@@ -142,7 +164,7 @@ class StaticMap:
         ends = np.cumsum([len(points) for _, _, points in seen])
         for (owner, voxels, _), part in zip(seen, np.split(through, ends[:-1]), strict=True):
             if np.any(part):
-                self._submap(owner).weaken(voxels[part])
+                yield owner, voxels[part]
 
     def _in_sight(
         self, T_map_sensor: Array, owners: "_Owners"
@@ -160,29 +182,53 @@ class StaticMap:
             owner = owners.ids[known[i]]
             yield owner, *in_sight(self._submaps[owner].means, invert(T_owner_sensor[i]))
 
-    def _hit(self, keyframe: Keyframe, T_map_keyframe: Array, owners: "_Owners") -> None:
-        """Count a keyframe for the voxels that it hit; hold new ones against the views before it."""
-        points = keyframe.points
-        points = points[np.einsum("ni,ni->n", points, points) < self.max_range**2]
-        moved = transform(T_map_keyframe, points.astype(np.float64))
-        voxels = owners.divide(moved, np.ones(len(points), np.uint8), self.voxel_size)
+    def _hit(
+        self, keyframes: Sequence[Keyframe], T_map_keyframes: Sequence[Array], owners: "_Owners"
+    ) -> None:
+        """Count keyframes for the voxels that they hit; hold new ones against the views around."""
+        hits = [
+            self._hits(keyframe, T, owners)
+            for keyframe, T in zip(keyframes, T_map_keyframes, strict=True)
+        ]
+        T_odom_first = keyframes[0].T_odom_sensor
+        samples = [
+            transform(invert(T_odom_first) @ keyframe.T_odom_sensor, points).astype(np.float32)
+            for keyframe, (_, points) in zip(keyframes, hits, strict=True)
+        ]
+        voxels = _Voxels.group(
+            np.concatenate([hit.owners for hit, _ in hits]),
+            np.concatenate([hit.means for hit, _ in hits]),
+            np.concatenate([hit.weights for hit, _ in hits]),
+            self.voxel_size,
+        )
         parts = [(self._submap(owners.ids[i]), part) for i, part in voxels.by_owner()]
         known = [submap.contains(voxels.keys[part]) for submap, part in parts]
         is_new = ~np.concatenate([np.zeros(0, np.bool_), *known])
-        samples = points[voxels.order[voxels.starts[is_new]]]
-        scores = np.ones(len(voxels.keys), np.int64)
-        scores[is_new] -= self._looks_back(samples, keyframe.T_odom_sensor)
+        new = voxels.order[voxels.starts[is_new]]
+        scores = np.diff(voxels.starts, append=len(voxels.order))
+        scores[is_new] -= self._looks_around(np.concatenate(samples)[new], T_odom_first)
         for submap, part in parts:
             submap.merge(voxels.keys[part], voxels.means[part], voxels.weights[part], scores[part])
 
-    def _looks_back(self, points: Points, T_odom_sensor: Array) -> NDArray[np.int64]:
-        """Count for each of (N, 3) points in a sensor's frame how many recent views looked through.
+    def _hits(
+        self, keyframe: Keyframe, T_map_keyframe: Array, owners: "_Owners"
+    ) -> tuple["_Voxels", Array]:
+        """Return the M voxels that a keyframe hit, and a point in each, (M, 3) in its own frame."""
+        points = keyframe.points
+        points = points[np.einsum("ni,ni->n", points, points) < self.max_range**2]
+        points = points.astype(np.float64)
+        moved = transform(T_map_keyframe, points)
+        voxels = owners.divide(moved, np.ones(len(points), np.uint8), self.voxel_size)
+        return voxels, points[voxels.order[voxels.starts]]
+
+    def _looks_around(self, points: Points, T_odom_points: Array) -> NDArray[np.int64]:
+        """Count for each of (N, 3) points in a frame of odometry how many recent views looked through.
 
         Odometry relates the views: it is good over their distance, and optimisation leaves it alone.
         """
         counts = np.zeros(len(points), np.int64)
         for view in self._views:
-            near, seen = in_sight(points, invert(view.T_odom_sensor) @ T_odom_sensor)
+            near, seen = in_sight(points, invert(view.T_odom_sensor) @ T_odom_points)
             counts[near] += view.looks_through(seen)
         return counts
 

@@ -111,14 +111,14 @@ class Submap:
         """
         np.minimum(self.scores, DOUBTED, out=self.scores)
 
-    def weaken(self, voxels: NDArray[np.intp]) -> None:
-        """Take one from the scores of voxels (M,), given by index, and forget those at `LOW`."""
-        self.scores[voxels] -= 1
-        dead = voxels[self.scores[voxels] <= LOW]
-        if len(dead):
-            alive = np.delete(np.arange(len(self.keys)), dead)
+    def weaken(self, looks: NDArray[np.integer]) -> None:
+        """Take (N,) looks from the voxels' scores, and forget those that come down to `LOW`."""
+        scores = self.scores - looks
+        alive = np.flatnonzero(scores > LOW)
+        self.scores = scores[alive].astype(np.int8)
+        if len(alive) < len(self.keys):
             self.keys, self.means = self.keys[alive], self.means.take(alive, axis=0)
-            self.weights, self.scores = self.weights[alive], self.scores[alive]
+            self.weights = self.weights[alive]
 
     def _find(self, keys: Keys) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Return where each of (M,) keys is or would be, and whether it is there."""
