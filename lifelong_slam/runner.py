@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
-from lifelong_slam.resources import ResourceMonitor, release_free_memory
+from lifelong_slam.resources import FreeMemory, ResourceMonitor
 from lifelong_slam.result import GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
@@ -27,8 +27,6 @@ from lifelong_slam.systems.system import System
 from lifelong_slam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
-
-_RELEASE_EVERY = 20  # scans; it takes a few milliseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,12 +200,12 @@ def _feed(
     monitor: ResourceMonitor,
 ) -> list[TimelineRow]:
     timeline = []
+    free_memory = FreeMemory(monitor.rss_mb)
     for scan in scans:
         stop.running = True
         times = system.process(scan)
         timeline.append(_row(scan, times, monitor))
-        if len(timeline) % _RELEASE_EVERY == 0:
-            release_free_memory()
+        free_memory.release()
         for observer in observers:
             observer.update(scan, times)
         if stop.requested:

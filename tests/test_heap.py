@@ -1,5 +1,6 @@
 """A heap's blocks are allocated by one thread that does nothing else."""
 
+import itertools
 import threading
 
 import numpy as np
@@ -50,8 +51,13 @@ class NotingMap:
 
 
 def test_the_local_maps_of_odometry_are_filled_in_heaps_of_their_own():
-    of_recent, of_surfaces = set(), set()
-    recent = RecentMap(lambda: NotingMap(of_recent))
+    of_recent, of_surfaces = [], set()
+
+    def new_map():
+        of_recent.append(set())
+        return NotingMap(of_recent[-1])
+
+    recent = RecentMap(new_map)
     for step in range(50):
         recent.update(np.zeros((1, 3)), exp(np.array([0, 0, 0, step * STRETCH / 10, 0, 0])))
     surfaces = SurfaceRefinement(1.0)
@@ -59,5 +65,10 @@ def test_the_local_maps_of_odometry_are_filled_in_heaps_of_their_own():
     surfaces.insert(
         Cloud.prepare(np.random.default_rng(0).uniform(-5, 5, (500, 3)), 1.0), np.eye(4)
     )
-    assert len(of_recent) == len(of_surfaces) == 1
-    assert len(of_recent | of_surfaces | {threading.get_ident()}) == 3
+    assert len(of_recent) > 5
+    assert all(len(threads) == 1 for threads in [*of_recent, of_surfaces])
+    # A new map has the heap of the one that went, not that of the one beside it.
+    for older, younger in itertools.pairwise(of_recent):
+        assert older != younger
+    assert len(set.union(*of_recent)) == 2
+    assert len(set.union(*of_recent, of_surfaces, {threading.get_ident()})) == 4

@@ -28,11 +28,12 @@ class RecentMap:
             new_map: makes an empty voxel map.
         """
         self._new_map = new_map
-        self._heap = Heap()
-        self._younger = new_map()
+        # One each, so that a map that goes leaves all of its heap to the one that begins.
+        self._heaps = [Heap(), Heap()]
         self._travelled = 0.0
         self._position: Array | None = None
         self.current = new_map()
+        self._younger = new_map()
 
     def update(self, points: Array, T_odom_sensor: Array) -> None:
         """Enter (N, 3) points of a scan with its (4, 4) pose."""
@@ -43,5 +44,6 @@ class RecentMap:
         if self._travelled >= STRETCH:
             self._travelled = 0.0
             self.current, self._younger = self._younger, self._new_map()
-        for voxel_map in (self.current, self._younger):
-            self._heap.call(voxel_map.update, points, T_odom_sensor)
+            self._heaps.reverse()
+        for voxel_map, heap in zip((self.current, self._younger), self._heaps, strict=True):
+            heap.call(voxel_map.update, points, T_odom_sensor)
