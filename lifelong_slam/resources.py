@@ -14,7 +14,7 @@ import psutil
 
 _MEGABYTE = 1e6
 _PERIOD = 0.5
-_HELD = 32.0  # MB; giving them back takes some 4 ms, and 6 ms when they are taken again
+_HELD = 128.0  # MB, about what a scan with a settling takes; to give and take them costs 40 ms
 _OVERHEAD = 0.01  # share of a core that sampling may take: it lists all processes of the machine
 
 

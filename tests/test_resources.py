@@ -69,6 +69,7 @@ def test_free_memory_is_given_back_whenever_much_of_it_is_held(monkeypatch):
         now[0] -= 25.0
 
     monkeypatch.setattr(resources, "_trim", give_back)
+    monkeypatch.setattr(resources, "_HELD", 32.0)
     free_memory = FreeMemory(lambda: now[0])
     for now[0] in (500.0, 520.0, 531.0, 490.0, 521.0, 523.0):
         free_memory.release()
