@@ -7,13 +7,14 @@ import ctypes
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import psutil
 
 _MEGABYTE = 1e6
 _PERIOD = 0.5
-_HELD = 128.0  # MB, about what a run takes for a moment; taking them again costs 60 ms
+_HELD = 128.0  # MB; taking them again costs 60 ms
 _OVERHEAD = 0.01  # share of a core that sampling may take: it lists all processes of the machine
 
 
@@ -126,15 +127,19 @@ class FreeMemory:
     the free pages: the process would seem to grow for ever. Other C libraries see to it themselves.
     """
 
-    def __init__(self) -> None:
-        self._least = math.inf  # MB, since memory was last given back
+    def __init__(self, rss_mb: Callable[[], float]) -> None:
+        """Watch resident memory, as `ResourceMonitor.rss_mb` measures it."""
+        self._rss_mb = rss_mb
+        self._least = math.inf
 
-    def release(self, rss_mb: float) -> None:
-        """Hear of the resident memory, and give back what is free if it has grown by `_HELD`."""
+    def release(self) -> None:
+        """Give free memory back if the process has grown by `_HELD` since it was least."""
+        rss_mb = self._rss_mb()
         self._least = min(self._least, rss_mb)
         if rss_mb > self._least + _HELD:
             _trim()
-            self._least = math.inf
+            # Now, and not after the next scan, which may take much of it again at once.
+            self._least = self._rss_mb()
 
 
 def _trim() -> None:

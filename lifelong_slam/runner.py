@@ -200,12 +200,12 @@ def _feed(
     monitor: ResourceMonitor,
 ) -> list[TimelineRow]:
     timeline = []
-    free_memory = FreeMemory()
+    free_memory = FreeMemory(monitor.rss_mb)
     for scan in scans:
         stop.running = True
         times = system.process(scan)
         timeline.append(_row(scan, times, monitor))
-        free_memory.release(timeline[-1].rss_mb)
+        free_memory.release()
         for observer in observers:
             observer.update(scan, times)
         if stop.requested:

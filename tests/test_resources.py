@@ -26,16 +26,16 @@ from lifelong_slam.resources import FreeMemory
 def rss_mb():
     return psutil.Process().memory_info().rss / 1e6
 
-free_memory = FreeMemory()
+free_memory = FreeMemory(rss_mb)
 print(rss_mb())
-free_memory.release(rss_mb())
+free_memory.release()
 kept, scratch = [], []
 for _ in range(2000):
     scratch.append(bytearray(100_000))
     kept.append(bytearray(1000))
 print(rss_mb())
 scratch.clear()
-free_memory.release(rss_mb())
+free_memory.release()
 print(rss_mb())
 """
 
@@ -81,16 +81,21 @@ def test_memory_counts_children_while_they_live(monkeypatch):
 
 
 def test_free_memory_is_given_back_whenever_much_of_it_is_held(monkeypatch):
-    times = []
-    monkeypatch.setattr(resources, "_trim", lambda: times.append(1))
+    now, given_back = [0.0], []
+
+    def give_back():
+        given_back.append(now[0])
+        now[0] -= 25.0
+
+    monkeypatch.setattr(resources, "_trim", give_back)
     monkeypatch.setattr(resources, "_HELD", 32.0)
-    free_memory = FreeMemory()
-    gave = []
-    for rss_mb in (500.0, 520.0, 531.0, 490.0, 521.0, 523.0, 498.0, 529.0, 531.0, 535.0, 506.0):
-        times.clear()
-        free_memory.release(rss_mb)
-        gave += [rss_mb] * len(times)
-    assert gave == [523.0, 531.0]  # more than 32 above 490, then above 498
+    free_memory = FreeMemory(lambda: now[0])
+    for now[0] in (500.0, 520.0, 531.0, 490.0, 521.0, 523.0):
+        free_memory.release()
+    assert given_back == [523.0]  # more than 32 above 490
+    for now[0] in (500.0, 529.0, 531.0, 506.0, 530.0, 539.0):
+        free_memory.release()
+    assert given_back == [523.0, 531.0, 539.0]  # above 498, then 506
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
