@@ -129,7 +129,7 @@ def measure(overrides: Sequence[str], count: int) -> list[Lap]:
     seed_everything(config.seed)
     system, source = build(config.system), build(config.scenario)
     yardstick = Yardstick(source)
-    timeline = run(source, system, [yardstick]).timeline
+    timeline = list(run(source, system, [yardstick]).timeline)
     laps = []
     for number in range(count):
         rows = timeline[_part(len(timeline), number, count)]

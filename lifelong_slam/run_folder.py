@@ -8,6 +8,7 @@ X = `T_base_sensor` each pose becomes ``X T_map_sensor(i) X^-1`` and each map po
 import csv
 import io
 import os
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,28 +21,17 @@ from lifelong_slam.io.bags import write_cloud_bag, write_pose_bag
 from lifelong_slam.io.g2o import write_g2o
 from lifelong_slam.io.ply import write_ply
 from lifelong_slam.result import Edge, GraphSnapshot
+from lifelong_slam.timeline import COLUMNS, Timeline
 from lifelong_slam.trajectory import Trajectory, format_seconds, write_tum
 
 if TYPE_CHECKING:
-    from lifelong_slam.runner import RunRecord, TimelineRow
+    from lifelong_slam.runner import RunRecord
 
 TRAJECTORY = "trajectory.tum"
 REFERENCE = "reference.tum"
 POSE_GRAPH = "pose_graph.g2o"
 REFERENCE_MAP = "reference_map.ply"
 TIMELINE = "timeline.csv"
-_COLUMNS = (
-    "stamp",
-    "odometry_ms",
-    "loop_ms",
-    "optimise_ms",
-    "prune_ms",
-    "vertices",
-    "edges",
-    "rss_mb",
-    "child_rss_mb",
-    "cpu_percent",
-)
 _BLOCK = 1_000_000
 
 
@@ -133,14 +123,13 @@ def graph_to_base(graph: GraphSnapshot, T_base_sensor: NDArray[np.float64]) -> G
     )
 
 
-def write_timeline(path: Path, rows: "list[TimelineRow]") -> None:
+def write_timeline(path: Path, timeline: Timeline) -> None:
     """Write one CSV row a scan: stamp in seconds, stages in ms, graph size, memory, CPU."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for row in rows:
-        values = [getattr(row, column) for column in _COLUMNS[1:]]
-        writer.writerow([format_seconds(row.stamp), *map(_number, values)])
+    writer.writerow(COLUMNS)
+    for stamp, *values in map(astuple, timeline):
+        writer.writerow([format_seconds(stamp), *map(_number, values)])
     with atomic_write(path) as file:
         file.write(text.getvalue().encode())
 

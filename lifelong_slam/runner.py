@@ -24,29 +24,10 @@ from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
 from lifelong_slam.sources.source import Source
 from lifelong_slam.systems.system import System
+from lifelong_slam.timeline import Timeline, TimelineRow
 from lifelong_slam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class TimelineRow:
-    """Where the time of one scan went, and what the run held after it (a row of timeline.csv).
-
-    Memory of the process itself is as after the scan; that of its children, and CPU (100 is one
-    core), as sampled last, see `lifelong_slam.resources`.
-    """
-
-    stamp: int
-    odometry_ms: float
-    loop_ms: float
-    optimise_ms: float
-    prune_ms: float
-    vertices: int
-    edges: int
-    rss_mb: float
-    child_rss_mb: float
-    cpu_percent: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +47,7 @@ class RunRecord:
     """
 
     result: SlamResult
-    timeline: list[TimelineRow]
+    timeline: Timeline
     counts: dict[str, int]
     wall_seconds: float
     peak_rss_mb: float
@@ -198,8 +179,8 @@ def _feed(
     observers: Sequence[Observer],
     stop: StopRequest,
     monitor: ResourceMonitor,
-) -> list[TimelineRow]:
-    timeline = []
+) -> Timeline:
+    timeline = Timeline()
     free_memory = FreeMemory(monitor.rss_mb)
     for scan in scans:
         stop.running = True

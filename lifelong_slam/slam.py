@@ -18,7 +18,7 @@ from lifelong_slam.geometry import adjoint, invert
 from lifelong_slam.graph.marginalisation import StarMesh
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.pruning import Pruner, Pruning
-from lifelong_slam.graph.removal import Removal, recover
+from lifelong_slam.graph.removal import Removal, RemovalLog, recover
 from lifelong_slam.graph.selection import Everything
 from lifelong_slam.loop_closure.closer import LoopCloser, relative_covariance
 from lifelong_slam.mapping.keyframe import Keyframe, KeyframeSelector
@@ -79,7 +79,7 @@ class LifelongSlam:
         self._track = Track()
         self._keyframes: dict[int, Keyframe] = {}  # those that are vertices
         self._window: list[int] = []
-        self._removals: list[Removal] = []
+        self._removals = RemovalLog()
         self._session: MapSession | None = None
         self._map_points: NDArray[np.float32] | None = None  # of a map that stays as it is
         self._unsaved = _Unsaved()
@@ -256,7 +256,7 @@ class LifelongSlam:
         self._loop_closer.places.rehome(removed, poses, lasting)
         for vertex in removed:
             del self._keyframes[vertex]
-        self._removals += removals
+        self._removals.extend(removals)
         self._unsaved.removals += removals
         self._unsaved.settled += leaving
 

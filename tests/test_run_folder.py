@@ -25,7 +25,8 @@ from lifelong_slam.run_folder import (
     trajectory_to_base,
     write_run,
 )
-from lifelong_slam.runner import RunRecord, TimelineRow
+from lifelong_slam.runner import RunRecord
+from lifelong_slam.timeline import Timeline, TimelineRow
 from lifelong_slam.trajectory import Trajectory, read_tum
 
 EPOCH = 1_700_000_000_123_456_789
@@ -38,8 +39,8 @@ def some_record(count=60, points=1000):
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 100_000_000
     cloud = rng.normal(size=(points, 3)).astype(np.float32) * 20
     result = SlamResult(Trajectory(stamps, poses), cloud, some_graph(rng))
-    timeline = [TimelineRow(int(s), 20.5, 1.25, 0.0, 0.0, 3, 2, 512.0, 64.0, 150.0) for s in stamps]
-    return RunRecord(result, timeline, {}, 2.0, 600.0, False)
+    rows = [TimelineRow(int(s), 20.5, 1.25, 0.0, 0.0, 3, 2, 512.0, 64.0, 150.0) for s in stamps]
+    return RunRecord(result, Timeline(rows), {}, 2.0, 600.0, False)
 
 
 def some_reference(record):

@@ -7,7 +7,7 @@ and not frozen to one of them, a removed pose goes on improving with the graph, 
 unpruned one.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.geometry import adjoint, exp, invert, log
 from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.growing_array import GrowingArray
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,42 @@ class Removal:
     neighbours: NDArray[np.int64]
     T_neighbour_vertex: Array
     gains: Array
+
+
+class RemovalLog:
+    """All removals of a run, in the order in which they were made."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._vertices = GrowingArray((), np.int64)
+        self._ends = GrowingArray((), np.int64)  # of each vertex's rows in what follows
+        self._neighbours = GrowingArray((), np.int64)
+        self._T_neighbour_vertex = GrowingArray((4, 4), np.float64)
+        # They weigh shifts of metres at most, which single precision gives to a micrometre.
+        self._gains = GrowingArray((6, 6), np.float32)
+
+    def extend(self, removals: Iterable[Removal]) -> None:
+        """Take in copies of removals."""
+        for removal in removals:
+            self._neighbours.extend(removal.neighbours)
+            self._T_neighbour_vertex.extend(removal.T_neighbour_vertex)
+            self._gains.extend(removal.gains)
+            self._vertices.append(removal.vertex)
+            self._ends.append(len(self._neighbours))
+
+    def __len__(self) -> int:
+        return len(self._vertices)
+
+    def __iter__(self) -> Iterator[Removal]:
+        start = 0
+        for vertex, end in zip(self._vertices.rows.tolist(), self._ends.rows.tolist(), strict=True):
+            yield Removal(
+                vertex,
+                self._neighbours.rows[start:end],
+                self._T_neighbour_vertex.rows[start:end],
+                self._gains.rows[start:end],
+            )
+            start = end
 
 
 def removal_of(graph: PoseGraph, vertex: int) -> Removal:

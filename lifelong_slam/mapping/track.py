@@ -6,24 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import exp, invert, log
+from lifelong_slam.growing_array import GrowingArray
 from lifelong_slam.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
-_ROOM = 1024  # scans to begin with; it is doubled when they have come
 
 
 class Track:
     """Remembers where every scan was by odometry, so that the graph can say where it was on the map.
 
-    Keyframes may leave the graph; of a scan there is nothing to keep but its stamp and its pose. They are
-    kept in one block: a small array for each, left behind among what a scan takes for a moment, would keep
-    a page of memory each from being given back.
+    Keyframes may leave the graph; of a scan there is nothing to keep but its stamp and its pose.
     """
 
     def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._room: Array = np.empty((_ROOM, 4, 4))
+        self._stamps = GrowingArray((), np.int64)
+        self._T_odom_sensor = GrowingArray((4, 4), np.float64)
         self._keyframes: list[int] = []
         self._at: list[int] = []  # index of each keyframe's scan
         self.travelled = 0.0  # metres
@@ -33,19 +30,11 @@ class Track:
 
     def add(self, stamp: int, T_odom_sensor: Array) -> None:
         """Take in a scan."""
-        count = len(self._stamps)
-        if count:
-            step = T_odom_sensor[:3, 3] - self._room[count - 1, :3, 3]
+        if len(self):
+            step = T_odom_sensor[:3, 3] - self._T_odom_sensor.rows[-1, :3, 3]
             self.travelled += float(np.linalg.norm(step))
-        if count == len(self._room):
-            self._room = np.concatenate([self._room, np.empty_like(self._room)])
-        self._room[count] = T_odom_sensor
+        self._T_odom_sensor.append(T_odom_sensor)
         self._stamps.append(stamp)
-
-    @property
-    def _T_odom_sensor(self) -> Array:
-        """(N, 4, 4) of all scans so far."""
-        return self._room[: len(self._stamps)]
 
     def mark_keyframe(self, keyframe: int) -> None:
         """Note that the newest scan is a keyframe."""
@@ -59,7 +48,8 @@ class Track:
 
     def since_keyframe(self) -> Array:
         """Return (4, 4) T_keyframe_sensor, the motion from the newest keyframe to the newest scan."""
-        T: Array = invert(self._T_odom_sensor[self._at[-1]]) @ self._T_odom_sensor[-1]
+        odometry = self._T_odom_sensor.rows
+        T: Array = invert(odometry[self._at[-1]]) @ odometry[-1]
         return T
 
     def scans_before_newest(self) -> tuple[int, NDArray[np.int64], Array] | None:
@@ -72,14 +62,16 @@ class Track:
         if len(self._at) < 2:
             return None
         first, end = self._at[-2], self._at[-1]
-        T = invert(self._T_odom_sensor[first]) @ self._T_odom_sensor[first:end]
-        return self._keyframes[-2], np.array(self._stamps[first:end]), T
+        return self._keyframes[-2], *self._scans(first, end)
 
     def scans_after_newest(self) -> tuple[int, NDArray[np.int64], Array]:
         """Return the scans from the newest keyframe on, as above."""
-        first = self._at[-1]
-        T = invert(self._T_odom_sensor[first]) @ self._T_odom_sensor[first:]
-        return self._keyframes[-1], np.array(self._stamps[first:]), T
+        return self._keyframes[-1], *self._scans(self._at[-1], len(self))
+
+    def _scans(self, first: int, end: int) -> tuple[NDArray[np.int64], Array]:
+        """Return stamps and poses of some scans, in the frame of the first."""
+        odometry = self._T_odom_sensor.rows
+        return self._stamps.rows[first:end].copy(), invert(odometry[first]) @ odometry[first:end]
 
     def trajectory(self, T_map_keyframe: Array) -> Trajectory:
         """Return the pose of every scan on the map.
@@ -90,8 +82,8 @@ class Track:
         Args:
             T_map_keyframe: (K, 4, 4) of all keyframes in their order.
         """
-        stamps = np.array(self._stamps, dtype=np.int64)
-        odometry = self._T_odom_sensor
+        stamps = self._stamps.rows.copy()
+        odometry = self._T_odom_sensor.rows
         at = np.array(self._at)
         before = np.searchsorted(at, np.arange(len(stamps)), side="right") - 1
         after = np.minimum(before + 1, len(at) - 1)
