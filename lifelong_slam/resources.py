@@ -3,18 +3,14 @@
 As in paper 001, section 2, sampled with psutil: CPU in percent of one core, resident memory in MB.
 """
 
-import ctypes
-import math
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import psutil
 
 _MEGABYTE = 1e6
 _PERIOD = 0.5
-_HELD = 128.0  # MB; taking them again costs 60 ms
 _OVERHEAD = 0.01  # share of a core that sampling may take: it lists all processes of the machine
 
 
@@ -52,7 +48,7 @@ class ResourceMonitor:
         self._process = psutil.Process()
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._sample_on, daemon=True)
-        self._samples: list[ResourceSample] = []
+        self._count, self._total_mb = 0, 0.0
         self._start = self._last = time.perf_counter()
         self.peak_rss_mb = 0.0
         self.wall_seconds = 0.0
@@ -60,7 +56,8 @@ class ResourceMonitor:
 
     def __enter__(self) -> "ResourceMonitor":
         self._start = self._last = time.perf_counter()
-        self._samples = [self._measure()]
+        self._note(self._measure())
+        self._cpu_seconds = self.latest.cpu_seconds
         self._thread.start()
         return self
 
@@ -69,16 +66,12 @@ class ResourceMonitor:
         self._thread.join()
         self._sample()
         self.wall_seconds = self._last - self._start
-        used = self.latest.cpu_seconds - self._samples[0].cpu_seconds
+        used = self.latest.cpu_seconds - self._cpu_seconds
         self.cpu_percent = 100.0 * used / self.wall_seconds
 
     @property
-    def latest(self) -> ResourceSample:  # noqa: D102 - see the class
-        return self._samples[-1]
-
-    @property
     def mean_rss_mb(self) -> float:  # noqa: D102 - see the class
-        return sum(s.rss_mb + s.child_rss_mb for s in self._samples) / len(self._samples)
+        return self._total_mb / self._count
 
     def rss_mb(self) -> float:
         """Return the resident memory of the process now, and remember the peak with it."""
@@ -98,10 +91,12 @@ class ResourceMonitor:
         used = measured.cpu_seconds - self.latest.cpu_seconds
         percent = 100.0 * max(used, 0.0) / (now - self._last)
         self._last = now
-        sample = ResourceSample(
-            measured.cpu_seconds, measured.rss_mb, measured.child_rss_mb, percent
-        )
-        self._samples.append(sample)
+        self._note(replace(measured, cpu_percent=percent))
+
+    def _note(self, sample: ResourceSample) -> None:
+        self.latest = sample
+        self._count += 1
+        self._total_mb += sample.rss_mb + sample.child_rss_mb
         self.peak_rss_mb = max(self.peak_rss_mb, sample.rss_mb + sample.child_rss_mb)
 
     def _measure(self) -> ResourceSample:
@@ -118,31 +113,3 @@ def _usage(process: psutil.Process) -> tuple[float, float]:
         return sum(process.cpu_times()[:4]), float(process.memory_info().rss) / _MEGABYTE
     except psutil.NoSuchProcess:  # it ended just now, and counts with its parent
         return 0.0, 0.0
-
-
-class FreeMemory:
-    """Gives back to the system what the C library holds for later use, whenever that has become much.
-
-    A scan takes megabytes for a moment and leaves a few small objects behind, between which glibc keeps
-    the free pages: the process would seem to grow for ever. Other C libraries see to it themselves.
-    """
-
-    def __init__(self, rss_mb: Callable[[], float]) -> None:
-        """Watch resident memory, as `ResourceMonitor.rss_mb` measures it."""
-        self._rss_mb = rss_mb
-        self._least = math.inf
-
-    def release(self) -> None:
-        """Give free memory back if the process has grown by `_HELD` since it was least."""
-        rss_mb = self._rss_mb()
-        self._least = min(self._least, rss_mb)
-        if rss_mb > self._least + _HELD:
-            _trim()
-            # Now, and not after the next scan, which may take much of it again at once.
-            self._least = self._rss_mb()
-
-
-def _trim() -> None:
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)

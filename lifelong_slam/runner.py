@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
-from lifelong_slam.resources import FreeMemory, ResourceMonitor
+from lifelong_slam.resources import ResourceMonitor
 from lifelong_slam.result import GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
@@ -181,12 +181,10 @@ def _feed(
     monitor: ResourceMonitor,
 ) -> Timeline:
     timeline = Timeline()
-    free_memory = FreeMemory(monitor.rss_mb)
     for scan in scans:
         stop.running = True
         times = system.process(scan)
         timeline.append(_row(scan, times, monitor))
-        free_memory.release()
         for observer in observers:
             observer.update(scan, times)
         if stop.requested:

@@ -25,6 +25,7 @@ from lifelong_slam.mapping.keyframe import Keyframe, KeyframeSelector
 from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.mapping.static_map import StaticMap, thin
 from lifelong_slam.mapping.track import Track
+from lifelong_slam.memory import kept
 from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate
 from lifelong_slam.result import Edge, GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
@@ -203,8 +204,8 @@ class LifelongSlam:
             T_odom_sensor=estimate.T_odom_sensor,
             covariance=estimate.covariance,
             travelled=self._track.travelled,
-            features=estimate.cloud.positions.astype(np.float32),
-            points=thin(estimate.points, self._static_map.voxel_size),
+            features=kept(estimate.cloud.positions.astype(np.float32)),
+            points=kept(thin(estimate.points, self._static_map.voxel_size)),
         )
         self._next_id += 1
         self._keyframes[keyframe.id] = keyframe

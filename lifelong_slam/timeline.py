@@ -5,7 +5,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from lifelong_slam.growing_array import GrowingArray
+from lifelong_slam.memory import GrowingArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Timeline:
 
     def __init__(self, rows: Iterable[TimelineRow] = ()) -> None:
         """Start with some rows."""
-        self._rows = GrowingArray((), _ROW)
+        self._rows = GrowingArray(np.zeros(0, _ROW))
         for row in rows:
             self.append(row)
 

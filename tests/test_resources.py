@@ -1,6 +1,5 @@
 """What a run costs: sampled while it runs, summed up afterwards."""
 
-import ctypes
 import subprocess
 import sys
 import time
@@ -15,29 +14,10 @@ from eval.files import GraphSketch
 from eval.metrics.graph import GraphSize
 from eval.metrics.resources import Memory, Processor, Speed, StageTimes
 from lifelong_slam import resources
-from lifelong_slam.resources import FreeMemory, ResourceMonitor
+from lifelong_slam.resources import ResourceMonitor
 
 BUSY = "import time; t = time.process_time()\nwhile time.process_time() - t < {seconds}: pass"
 HOLDING = "x = bytearray(150_000_000); print('held', flush=True); input()"
-FRAGMENTING = """
-import psutil
-from lifelong_slam.resources import FreeMemory
-
-def rss_mb():
-    return psutil.Process().memory_info().rss / 1e6
-
-free_memory = FreeMemory(rss_mb)
-print(rss_mb())
-free_memory.release()
-kept, scratch = [], []
-for _ in range(2000):
-    scratch.append(bytearray(100_000))
-    kept.append(bytearray(1000))
-print(rss_mb())
-scratch.clear()
-free_memory.release()
-print(rss_mb())
-"""
 
 
 def burn(seconds):
@@ -78,35 +58,6 @@ def test_memory_counts_children_while_they_live(monkeypatch):
         child.communicate(b"\n")
         wait_until(lambda: monitor.latest.child_rss_mb < others + 150)
     assert alone < monitor.mean_rss_mb < monitor.peak_rss_mb
-
-
-def test_free_memory_is_given_back_whenever_much_of_it_is_held(monkeypatch):
-    now, given_back = [0.0], []
-
-    def give_back():
-        given_back.append(now[0])
-        now[0] -= 25.0
-
-    monkeypatch.setattr(resources, "_trim", give_back)
-    monkeypatch.setattr(resources, "_HELD", 32.0)
-    free_memory = FreeMemory(lambda: now[0])
-    for now[0] in (500.0, 520.0, 531.0, 490.0, 521.0, 523.0):
-        free_memory.release()
-    assert given_back == [523.0]  # more than 32 above 490
-    for now[0] in (500.0, 529.0, 531.0, 506.0, 530.0, 539.0):
-        free_memory.release()
-    assert given_back == [523.0, 531.0, 539.0]  # above 498, then 506
-
-
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
-def test_memory_between_small_objects_comes_back():
-    """In a process of its own: this one may have free memory left from other tests."""
-    output = subprocess.run(
-        [sys.executable, "-c", FRAGMENTING], check=True, capture_output=True, text=True
-    ).stdout
-    before, held, after = map(float, output.split())
-    assert held > before + 150
-    assert after < before + 40
 
 
 def test_a_peak_between_two_samples_counts_if_it_was_looked_at(monkeypatch):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.geometry import adjoint, exp, invert, log
 from lifelong_slam.graph.pose_graph import PoseGraph
-from lifelong_slam.growing_array import GrowingArray
+from lifelong_slam.memory import GrowingArray
 
 Array = NDArray[np.float64]
 
@@ -45,12 +45,12 @@ class RemovalLog:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._vertices = GrowingArray((), np.int64)
-        self._ends = GrowingArray((), np.int64)  # of each vertex's rows in what follows
-        self._neighbours = GrowingArray((), np.int64)
-        self._T_neighbour_vertex = GrowingArray((4, 4), np.float64)
+        self._vertices = GrowingArray(np.zeros(0, np.int64))
+        self._ends = GrowingArray(np.zeros(0, np.int64))  # of each vertex's rows in what follows
+        self._neighbours = GrowingArray(np.zeros(0, np.int64))
+        self._T_neighbour_vertex = GrowingArray(np.zeros((0, 4, 4)))
         # They weigh shifts of metres at most, which single precision gives to a micrometre.
-        self._gains = GrowingArray((6, 6), np.float32)
+        self._gains = GrowingArray(np.zeros((0, 6, 6), np.float32))
 
     def extend(self, removals: Iterable[Removal]) -> None:
         """Take in copies of removals."""

@@ -1,9 +1,9 @@
 """The part of the map that one vertex of the graph carries."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
+
+from lifelong_slam.memory import GrowingArray
 
 Points = NDArray[np.float32]
 Keys = NDArray[np.int64]
@@ -38,7 +38,7 @@ class Submap:
         bounds: (2, 3) float32 lower and upper corner of a box that holds all means.
     """
 
-    __slots__ = ("bounds", "keys", "means", "scores", "weights")
+    __slots__ = ("_parts", "bounds")
 
     def __init__(
         self, keys: Keys, means: Points, weights: NDArray[np.uint8], scores: NDArray[np.int8]
@@ -52,8 +52,12 @@ class Submap:
             raise ValueError("a submap's keys, means, weights and scores must have one length")
         if np.any(np.diff(keys) <= 0):
             raise ValueError("a submap's keys must ascend")
-        self.keys, self.means = keys.copy(), means.copy()
-        self.weights, self.scores = weights.copy(), scores.copy()
+        self._parts = (
+            GrowingArray(keys),
+            GrowingArray(means),
+            GrowingArray(weights),
+            GrowingArray(scores),
+        )
         self.bounds = _bounds(means)
 
     @classmethod
@@ -61,6 +65,22 @@ class Submap:
         """Return one without voxels."""
         means = np.zeros((0, 3), np.float32)
         return cls(np.zeros(0, np.int64), means, np.zeros(0, np.uint8), np.zeros(0, np.int8))
+
+    @property
+    def keys(self) -> Keys:  # noqa: D102 - see the class
+        return self._parts[0].rows
+
+    @property
+    def means(self) -> Points:  # noqa: D102 - see the class
+        return self._parts[1].rows
+
+    @property
+    def weights(self) -> NDArray[np.uint8]:  # noqa: D102 - see the class
+        return self._parts[2].rows
+
+    @property
+    def scores(self) -> NDArray[np.int8]:  # noqa: D102 - see the class
+        return self._parts[3].rows
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return what the constructor takes, by name; they change as the submap does."""
@@ -113,12 +133,11 @@ class Submap:
 
     def weaken(self, looks: NDArray[np.integer]) -> None:
         """Take (N,) looks from the voxels' scores, and forget those that come down to `LOW`."""
-        scores = self.scores - looks
-        alive = np.flatnonzero(scores > LOW)
-        self.scores = scores[alive].astype(np.int8)
-        if len(alive) < len(self.keys):
-            self.keys, self.means = self.keys[alive], self.means.take(alive, axis=0)
-            self.weights = self.weights[alive]
+        self.scores[:] = np.maximum(self.scores - looks, LOW)
+        alive = np.flatnonzero(self.scores > LOW)
+        if len(alive) < len(self):
+            for part in self._parts:
+                part.replace(part.rows.take(alive, axis=0))
 
     def _find(self, keys: Keys) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Return where each of (M,) keys is or would be, and whether it is there."""
@@ -135,17 +154,13 @@ class Submap:
         weights: NDArray[np.integer],
         scores: NDArray[np.integer],
     ) -> None:
-        order = np.insert(np.arange(len(self.keys)), at, len(self.keys) + np.arange(len(at)))
+        order = np.insert(np.arange(len(self)), at, len(self) + np.arange(len(at)))
 
-        def join(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+        new = (keys, means, np.minimum(weights, _MAX_WEIGHT), scores)
+        for part, more in zip(self._parts, new, strict=True):
+            joined = np.concatenate([part.rows, more.astype(part.rows.dtype)])
             # `take` moves rows several times faster than indexing does.
-            joined = np.concatenate([old, new.astype(old.dtype)])
-            return np.asarray(joined.take(order, axis=0))
-
-        self.keys = join(self.keys, keys)
-        self.means = join(self.means, means)
-        self.weights = join(self.weights, np.minimum(weights, _MAX_WEIGHT))
-        self.scores = join(self.scores, scores)
+            part.replace(joined.take(order, axis=0))
         bounds = _bounds(means)
         self.bounds = np.stack(
             [np.minimum(self.bounds[0], bounds[0]), np.maximum(self.bounds[1], bounds[1])]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import exp, invert, log
-from lifelong_slam.growing_array import GrowingArray
+from lifelong_slam.memory import GrowingArray
 from lifelong_slam.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -19,8 +19,8 @@ class Track:
     """
 
     def __init__(self) -> None:
-        self._stamps = GrowingArray((), np.int64)
-        self._T_odom_sensor = GrowingArray((4, 4), np.float64)
+        self._stamps = GrowingArray(np.zeros(0, np.int64))
+        self._T_odom_sensor = GrowingArray(np.zeros((0, 4, 4)))
         self._keyframes: list[int] = []
         self._at: list[int] = []  # index of each keyframe's scan
         self.travelled = 0.0  # metres

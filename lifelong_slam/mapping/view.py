@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
+from lifelong_slam.memory import kept
+
 SIGHT = 30.0  # metres; further away pixels are wider than what moves
 
 _PIXEL = np.float32(np.radians(1.0))  # wide enough to hold a return of every sensor
@@ -45,8 +47,9 @@ class View:
         around = minimum_filter(image.reshape(_ROWS, _COLUMNS), 3, mode=("nearest", "wrap"))
         nearest = np.where(np.isfinite(image), image, around.ravel())
         nearest[np.isinf(nearest)] = 0.0
-        near = points[ranges < SIGHT + _MAX_CLEARANCE]
-        return cls(T_odom_sensor, nearest, cKDTree(near, balanced_tree=False, compact_nodes=False))
+        near = kept(points[ranges < SIGHT + _MAX_CLEARANCE].astype(np.float64))
+        returns = cKDTree(near, balanced_tree=False, compact_nodes=False)
+        return cls(T_odom_sensor, kept(nearest), returns)
 
     def looks_through(self, points: Points) -> NDArray[np.bool_]:
         """Tell for each of (N, 3) points in its frame, and in sight, whether a ray passed it.

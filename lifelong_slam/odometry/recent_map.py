@@ -6,7 +6,7 @@ import numpy as np
 from kiss_icp.mapping import VoxelHashMap
 from numpy.typing import NDArray
 
-from lifelong_slam.heap import Heap
+from lifelong_slam.memory import Heap
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert, log, rotation_angle
-from lifelong_slam.heap import Heap
+from lifelong_slam.memory import Heap
 from lifelong_slam.registration import Cloud, covariance_of
 
 Array = NDArray[np.float64]
