@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from map_closures.map_closures import MapClosures
 from scipy.spatial import cKDTree
 from slam_support import Lidar, World, box, error_of, ground, keyframe, planar, pole, town
 
 from lifelong_slam.geometry import exp, invert, transform
+from lifelong_slam.loop_closure import relocalisation
 from lifelong_slam.loop_closure.relocalisation import (
     LOCAL_MAP_LENGTH,
     LOCAL_MAP_RADIUS,
@@ -141,6 +143,30 @@ def test_a_place_is_still_found_after_any_number_of_queries(mapped):
         for _ in range(others):
             relocaliser.candidates(NOWHERE, {7})
         assert [c.reference_id for c in relocaliser.candidates(query.points, {7})] == [7]
+
+
+def test_places_are_matched_with_queries_and_with_nothing_else(mapped, monkeypatch):
+    """A match takes milliseconds: a new place must not cost more the more places there are."""
+    world, _, _ = mapped
+    (place,) = local_maps(visit(world, np.arange(-10.0, 13.0, 2.0))[0])
+    matches = []
+
+    class Counting(MapClosures):
+        def get_top_k_closures(self, *arguments):
+            closures = super().get_top_k_closures(*arguments)
+            matches.append(len(closures))
+            return closures
+
+    monkeypatch.setattr(relocalisation, "MapClosures", Counting)
+    relocaliser = Relocaliser(VOXEL)
+    for i in range(20):
+        relocaliser.add_place(i, place.points)
+    assert matches == [0] * 20
+    for _ in range(40):
+        matches.clear()
+        candidates = relocaliser.candidates(place.points, {3, 18})
+        assert sum(matches) == 20
+        assert {candidate.reference_id for candidate in candidates} == {3, 18}
 
 
 def test_maps_of_nothing_are_located_nowhere(mapped):

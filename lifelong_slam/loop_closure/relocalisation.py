@@ -42,6 +42,7 @@ _PIXEL = 0.75  # pixel of a density image over the voxel of registration
 _CONES = np.radians([35.0, 18.0, 9.0, 5.0, 5.0])  # around the up so far, where ground is sought
 _SHELF = 16  # places in one database of map-closures
 _STEP = 4  # map-closures never matches two local maps whose numbers differ by less
+_QUERIES = _SHELF  # that a database takes in before it is made anew: it can't forget them
 _PENDING = 3  # latest locations that a new one may agree with
 _RIVAL = 0.8  # share of the best support from which a place elsewhere makes it ambiguous
 
@@ -137,8 +138,10 @@ class _Place:
 class _Shelf:
     """A database of a few places.
 
-    map-closures compares whatever it takes in with all that it holds, and can't forget: in one
-    database the cost of filling it would grow with the square of the map, and queries would stay.
+    map-closures matches whatever it takes in with all that it has under lower numbers, which takes
+    some 16 ms each, and can't forget. So numbers descend, those of places below those of queries: a
+    place is matched with nothing, a query with all places and with no other query. Its memory is as
+    large as the largest number, which is why there are few places in each.
     """
 
     def __init__(self, resolution: float) -> None:
@@ -147,30 +150,31 @@ class _Shelf:
         self._clear()
 
     def add(self, place: _Place) -> None:
+        self._enter(len(self._places), place)
         self._places.append(place)
-        self._enter(place)
 
     def match(self, levelled: Array) -> list[tuple[_Place, ClosureCandidate]]:
         """Return the places that (N, 3) points, levelled, resemble."""
-        if len(self._entries) >= 2 * _SHELF:
+        if self._queries == _QUERIES:
             self._clear()
-            for place in self._places:
-                self._enter(place)
-        closures = self._take_in(None, levelled)
-        entries = [(self._entries[closure.source_id // _STEP], closure) for closure in closures]
-        return [(place, closure) for place, closure in entries if place is not None]
+            for i, place in enumerate(self._places):
+                self._enter(i, place)
+        self._queries += 1
+        number = _SHELF + _QUERIES - self._queries
+        closures = self._take_in(number, levelled)
+        return [(self._places[_SHELF - 1 - c.source_id // _STEP], c) for c in closures]
 
     def _clear(self) -> None:
         self._detector = MapClosures(self._config)
-        self._entries: list[_Place | None] = []  # as map-closures numbers them; None for a query
+        self._queries = 0
 
-    def _enter(self, place: _Place) -> None:
-        self._take_in(place, transform(place.T_level_reference, place.points.astype(np.float64)))
+    def _enter(self, i: int, place: _Place) -> None:
+        levelled = transform(place.T_level_reference, place.points.astype(np.float64))
+        self._take_in(_SHELF - 1 - i, levelled)
 
-    def _take_in(self, entry: _Place | None, levelled: Array) -> list[ClosureCandidate]:
-        self._entries.append(entry)
-        number = _STEP * (len(self._entries) - 1)
-        closures: list[ClosureCandidate] = self._detector.get_top_k_closures(number, levelled, -1)
+    def _take_in(self, number: int, levelled: Array) -> list[ClosureCandidate]:
+        closures: list[ClosureCandidate]
+        closures = self._detector.get_top_k_closures(_STEP * number, levelled, -1)
         return closures
 
 
