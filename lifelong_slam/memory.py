@@ -54,7 +54,7 @@ class GrowingArray:
 
     @property
     def rows(self) -> NDArray[Any]:
-        """(N, *shape) view of all rows, until they become more."""
+        """(N, *shape) view of all rows, until they become more or others."""
         return self._room[: self._count]
 
     def append(self, row: ArrayLike) -> None:
