@@ -118,11 +118,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows: list[Pruned] = []
     for name in options.graphs:
         graph, truth = read(options.data, name)
-        result = reduce(graph, NoPruning(), keep=1.0)
+        result = reduce(graph, NoPruning(), keep=1.0, planar=graph.planar)
         wholes.append(whole(name, result, truth, graph.planar))
         print(f"{name}: optimised", file=sys.stderr)
         for method, pruning in prunings(options.methods, options.seeds):
-            pruned = reduce(result.graph, pruning, KEEP)
+            pruned = reduce(result.graph, pruning, KEEP, graph.planar)
             rows.append(compare(name, method, pruned, truth, graph.planar))
             print(f"{name}, {method}: done", file=sys.stderr)
         if options.out:

@@ -89,7 +89,7 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
     pruning = build(config.pruning)
     graph = read_g2o(Path(settings.graph))
     truth = read_truth(Path(settings.truth), graph.poses) if settings.truth else None
-    result = reduce(graph, pruning, settings.keep, settings.robust)
+    result = reduce(graph, pruning, settings.keep, graph.planar, settings.robust)
     if settings.out:
         if not result.complete:
             raise ConfigError(

@@ -119,7 +119,7 @@ def test_outvoted_closures_are_listed_and_come_back_when_others_confirm_them():
     assert len(graph.rejected) <= 3
 
 
-def slipped(slip=0.33):
+def slipped(slip=0.5):
     """Return true poses of two laps, and a graph whose odometry slipped, sure of itself, half-way."""
     truth, odometry, rng = laps(15)
     slip_at = odometry[20]
@@ -132,17 +132,17 @@ def slipped(slip=0.33):
     return graph, truth, rng
 
 
-def test_a_closure_that_contradicts_is_set_aside_until_several_say_the_same():
+def test_a_closure_that_contradicts_is_rejected_until_several_say_the_same():
     graph, truth, rng = slipped()
     before = graph.poses()
-    contradicting = [closure(truth, i, i + 30, rng) for i in (0, 5, 10)]
-    for count, loop in enumerate(contradicting[:2], 1):
+    contradicting = [closure(truth, i, i + 30, rng) for i in range(0, 14, 2)]
+    graph.add_edge(contradicting[0])
+    graph.optimise()
+    assert graph.rejected == contradicting[:1]
+    assert largest_error(graph, before.values()) < 1e-6
+    for loop in contradicting[1:]:
         graph.add_edge(loop)
         graph.optimise()
-        assert graph.rejected == contradicting[:count]
-        assert largest_error(graph, before.values()) < 1e-6
-    graph.add_edge(contradicting[2])
-    graph.optimise()
     assert graph.rejected == []
     for loop in contradicting:
         assert disagreement(loop, graph.poses()) < 22.5
@@ -156,17 +156,6 @@ def test_what_is_set_aside_is_not_what_agrees_and_came_with_it():
     graph.optimise()
     assert graph.rejected == [bad]
     assert good in graph.edges
-
-
-def test_what_was_set_aside_comes_in_when_asked_to_reconsider_and_enough_agree():
-    graph, truth, rng = slipped()
-    contradicting = [closure(truth, i, i + 30, rng) for i in (0, 5)]
-    for loop in contradicting:
-        graph.add_edge(loop)
-        graph.optimise()
-    assert graph.rejected == contradicting
-    graph.optimise(reconsider=True)
-    assert graph.rejected == []
 
 
 def test_derived_closures_in_place_of_others_change_nothing():

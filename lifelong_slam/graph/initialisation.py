@@ -5,15 +5,12 @@ the best one. Rotations that are found first, by the chordal relaxation, which i
 (Carlone, Tron, Daniilidis and Dellaert, *Initialization techniques for 3D SLAM*, ICRA 2015).
 """
 
-from collections.abc import Mapping
-
 import gtsam
 import networkx
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong_slam.geometry import invert, log
-from lifelong_slam.graph.pose_graph import INLIER_THRESHOLD
+from lifelong_slam.geometry import invert
 from lifelong_slam.result import Edge, GraphSnapshot
 
 Array = NDArray[np.float64]
@@ -78,27 +75,3 @@ def chordal(graph: GraphSnapshot) -> dict[int, Array]:
         shift = graph.poses[min(part)] @ invert(poses[min(part)])
         poses |= {vertex: shift @ poses[vertex] for vertex in part}
     return poses
-
-
-def best_start(graph: GraphSnapshot) -> dict[int, Array]:
-    """Return the graph's own poses or the chordal ones, whichever fit the edges better.
-
-    No loop closure counts for more than one that is plainly wrong, so that a few of those don't speak
-    for the poses that they bend.
-    """
-    return min((graph.poses, chordal(graph)), key=lambda poses: _misfit(graph.edges, poses))
-
-
-def _misfit(edges: list[Edge], poses: Mapping[int, Array]) -> float:
-    """Return the sum of squared Mahalanobis distances, those of loop closures truncated."""
-    if not edges:
-        return 0.0
-    sources = np.array([poses[edge.source] for edge in edges])
-    targets = np.array([poses[edge.target] for edge in edges])
-    measured = np.array([edge.T_source_target for edge in edges])
-    errors = log(invert(measured) @ invert(sources) @ targets)
-    covariances = np.array([edge.covariance for edge in edges])
-    whitened = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    distances = np.einsum("ij,ij->i", errors, whitened)
-    loop = np.array([edge.kind == "loop" for edge in edges])
-    return float(np.where(loop, np.minimum(distances, INLIER_THRESHOLD), distances).sum())

@@ -1,9 +1,7 @@
-"""A pose graph over keyframes, optimised by GTSAM, that no single loop closure can bend.
+"""A pose graph over keyframes, optimised by GTSAM, that no wrong loop closure bends.
 
-Odometry edges are trusted, loop closures are not. A new one that the others can't live with is set aside.
-When several have been, all closures, old and new, are put to the vote by graduated non-convexity (Yang et
-al., *Graduated non-convexity for robust spatial perception*, RA-L 2020): it starts from the convex problem,
-in which a true closure may move the map by metres, and sharpens until each closure is either in or out.
+Odometry edges are trusted, loop closures are not. A new one that fits comes in at once; when one doesn't, it
+is decided by a vote which of all closures are true (robust.py), those that were left out before among them.
 
 Vertices can be removed: what their edges said is then put in by whoever removes them (marginalisation.py).
 A graph may have several components, one for each session that hasn't been located in the map; each is
@@ -16,17 +14,16 @@ from collections.abc import Collection, Iterable, Mapping, Set
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from lifelong_slam.geometry import invert
+from lifelong_slam.graph.closure_problem import ClosureProblem, Trusted
+from lifelong_slam.graph.robust import fitted, objective, threshold, vote
 from lifelong_slam.result import Edge, GraphSnapshot
 
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
-INLIER_PROBABILITY = 0.999  # share of true closures whose error lies below the threshold
-INLIER_THRESHOLD = float(chi2.ppf(INLIER_PROBABILITY, 6))
-_SEVERAL = 3  # loop closures set aside since the last vote that call for another
+_SEVERAL = 3  # loop closures rejected since the last thorough vote that call for another
 _NEWS = 0.2  # metres; less doesn't mislead the search for loop closures
 _GAUGE_SIGMA = 1e-6  # m and rad; the root defines the frame
 
@@ -34,7 +31,15 @@ _GAUGE_SIGMA = 1e-6  # m and rad; the root defines the frame
 class PoseGraph:
     """Vertices with poses, and what was measured between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, planar: bool = False, trust_closures: bool = False) -> None:
+        """Start empty.
+
+        Args:
+            planar: all poses lie in a plane, and only what lies in it is measured.
+            trust_closures: no loop closure is ever rejected.
+        """
+        self._planar = planar
+        self._trust_closures = trust_closures
         self._values = gtsam.Values()
         self._roots: list[int] = []
         self._parted = False  # loop closures hold components together, which may fall apart
@@ -248,11 +253,16 @@ class PoseGraph:
         other = self.component(edge.source)
         if self._age(moved) < self._age(other):
             moved, shift = other, invert(shift)
-        for vertex in moved:
-            self._values.update(vertex, gtsam.Pose3(shift @ self.pose(vertex)))
+        self._move(moved, shift)
         self._roots = [root for root in self._roots if root not in moved]
         self._parted = True
         self.add_edge(edge)
+
+    def _move(self, component: Set[int], shift: Array) -> None:
+        """Move vertices as a whole."""
+        if not np.allclose(shift, np.eye(4), rtol=0, atol=1e-12):
+            for vertex in component:
+                self._values.update(vertex, gtsam.Pose3(shift @ self.pose(vertex)))
 
     def _age(self, component: Set[int]) -> int:
         """Return the rank of a component's root among the roots, the oldest first."""
@@ -269,39 +279,54 @@ class PoseGraph:
         return self._cost(self._loops - self._rejected)
 
     def optimise(self, reconsider: bool = False) -> None:
-        """Find the poses that fit the edges best.
+        """Find the poses that fit the edges best, and which loop closures are true.
 
         Args:
-            reconsider: put all loop closures to the vote if any is set aside; otherwise they vote
-                only if several have been since the last vote.
+            reconsider: vote on all loop closures if any is rejected; otherwise they vote only when a new one
+                doesn't fit.
         """
         new = self._new - self._rejected
         established = self._loops - self._rejected - new
         before = self._values
         if not (reconsider and self._rejected) and self._accept(new, established):
             return
-        if established and new and not reconsider:
-            accepted = set(established)
-            for key in sorted(new):
-                self._values = before
-                if self._accept({key}, accepted):
-                    accepted.add(key)
-                    before = self._values
-            self._values, self._rejected = before, self._loops - accepted
-            if len(self._rejected) - self._outvoted < _SEVERAL:
-                self._solve(accepted)
-                logger.info("%d loop closures are set aside", len(self._rejected))
-                return
-        self._vote(before, established)
+        self._values = before
+        doubtful = len(self._rejected | new) - self._outvoted
+        self._vote(established, thorough=reconsider or not established or doubtful >= _SEVERAL)
 
     def _accept(self, new: set[int], established: set[int]) -> bool:
-        """Solve with new loop closures, and tell whether all of them fit together."""
+        """Solve with new loop closures, and tell whether all of them fit."""
         # What the new closures cost all edges together: a lone one that is wrong bends a long chain
         # of odometry without any single edge, itself included, standing out.
         used = established | new
-        before = self._cost(established) if new else np.inf  # nothing to weigh without new ones
-        rise = self._solve(used) - before
-        return self._undisputed(used) and rise <= INLIER_THRESHOLD * len(new)
+        if not new:
+            self._solve(used)
+            return True
+        if not established:
+            return False
+        before = self._cost(established)
+        after = self._solve(used)
+        limit = threshold(self._dof)
+        fits = all(2 * self._factors[key].error(self._values) <= limit for key in used)
+        return (
+            fits
+            and after - before <= limit
+            and self._gains(before, after, len(established), len(new))
+        )
+
+    def _gains(self, before: float, after: float, established: int, new: int) -> bool:
+        """Tell whether the vote's objective is less with new closures than without."""
+        rejected = len(self._rejected)
+        return bool(
+            objective(np.array(after), np.array(established + new), np.array(rejected), self._dof)
+            < objective(
+                np.array(before), np.array(established), np.array(rejected + new), self._dof
+            )
+        )
+
+    @property
+    def _dof(self) -> int:
+        return 3 if self._planar else 6
 
     def _insert(self, vertex: int, T_map_vertex: Array) -> None:
         self._values.insert(vertex, gtsam.Pose3(T_map_vertex))
@@ -323,25 +348,43 @@ class PoseGraph:
             keys.discard(key)
         self._outvoted = min(self._outvoted, len(self._rejected))
 
-    def _undisputed(self, loops: set[int]) -> bool:
-        """Tell whether all of the given loop closures are as near to the estimate as true ones."""
-        return all(2 * self._factors[key].error(self._values) <= INLIER_THRESHOLD for key in loops)
+    def _vote(self, established: set[int], thorough: bool) -> None:
+        """Decide which loop closures are in, and solve with them.
 
-    def _vote(self, before: gtsam.Values, established: set[int]) -> None:
-        """Decide which loop closures are in, those from before or those that non-convexity picks.
-
-        Non-convexity is graduated by each closure's own residual, which a long chain of odometry can
-        absorb; the truncated squares that the vote means to minimise also count what that costs.
+        Args:
+            established: those that are in now.
+            thorough: don't only go on from these, but also from none and from all of them.
         """
-        candidates = []
-        for loops, start in ((self._graduated(before), self._values), (established, before)):
-            self._values = start
-            objective = self._solve(loops) + INLIER_THRESHOLD * len(self._loops - loops)
-            candidates.append((objective, loops, self._values))
-        _, loops, self._values = min(candidates, key=lambda candidate: candidate[0])
+        keys = sorted(self._loops)
+        poses = self.poses()
+        problem = ClosureProblem(
+            poses,
+            Trusted(
+                [edge for key, edge in self._edges.items() if key not in self._loops],
+                self._roots,
+                [factor for key, factor in self._factors.items() if key not in self._edges],
+            ),
+            {key: self._edges[key] for key in keys},
+            self._planar,
+        )
+        now = problem.values(poses)
+        everything = [(range(len(keys)), now), (range(len(keys)), problem.relaxed(poses))]
+        none = [((), problem.chained(poses))]
+        in_use = [([i for i, key in enumerate(keys) if key in established], now)]
+        if self._trust_closures:
+            choice = fitted(problem, everything)
+        else:
+            choice = vote(problem, [*none, *in_use, *everything] if thorough else in_use)
+        for vertex, T in problem.poses(choice.values).items():
+            self._values.update(vertex, gtsam.Pose3(T))
+        loops = {keys[i] for i in choice.accepted}
         self._rejected = self._loops - loops
-        self._outvoted = len(self._rejected)
-        logger.info("%d of %d loop closures are outvoted", self._outvoted, len(self._loops))
+        for root in self._gauges():
+            self._move(self.component(root), poses[root] @ invert(self.pose(root)))
+        self._solve(loops)
+        if thorough:
+            self._outvoted = len(self._rejected)
+        logger.info("%d of %d loop closures are rejected", len(self._rejected), len(self._loops))
 
     def _cost(self, loops: set[int]) -> float:
         """Return the sum of squared Mahalanobis distances with the given loop closures."""
@@ -354,23 +397,6 @@ class PoseGraph:
         self._values = optimiser.optimize()
         self._new -= loops
         return 2 * float(optimiser.error())
-
-    def _graduated(self, before: gtsam.Values) -> set[int]:
-        """Return the loop closures that graduated non-convexity lets in; poses follow."""
-        self._values = before
-        self._solve(self._loops)
-        graph = self._nonlinear_graph(self._loops)
-        gauges = graph.size() - len(self._factors)
-        keys = dict(enumerate(self._factors, start=gauges))
-        params = gtsam.GncLMParams(_lm())
-        params.setLossType(gtsam.GncLossType.TLS)
-        known = [i for i, key in keys.items() if key not in self._loops]
-        params.setKnownInliers([*range(gauges), *known])
-        optimiser = gtsam.GncLMOptimizer(graph, self._values, params)
-        optimiser.setInlierCostThresholdsAtProbability(INLIER_PROBABILITY)
-        self._values = optimiser.optimize()
-        weights = np.asarray(optimiser.getWeights())
-        return {key for i, key in keys.items() if key in self._loops and weights[i] >= 0.5}
 
     def _nonlinear_graph(self, loops: set[int]) -> gtsam.NonlinearFactorGraph:
         """Collect the gauges, all that is trusted and the given loop closures."""

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
-from lifelong_slam.graph.initialisation import best_start
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.pruning import Pruning
 from lifelong_slam.graph.removal import Removal, recover
@@ -61,7 +60,11 @@ class Reduction:
 
 
 def reduce(
-    snapshot: GraphSnapshot, pruning: Pruning, keep: float, robust: bool = True
+    snapshot: GraphSnapshot,
+    pruning: Pruning,
+    keep: float,
+    planar: bool = False,
+    robust: bool = True,
 ) -> Reduction:
     """Optimise a graph, remove vertices, and optimise what is left.
 
@@ -69,6 +72,7 @@ def reduce(
         snapshot: not changed; its edges need no particular start.
         pruning: the method.
         keep: share of the vertices that stay, if no more are needed to hold the graph together.
+        planar: all poses lie in a plane.
         robust: let loop closures vote, and leave out those that don't fit; else all count.
 
     Raises:
@@ -80,10 +84,9 @@ def reduce(
         raise ConfigError("the pose graph has no edges: there is nothing to reduce")
     logger.info("%d vertices, %d edges; optimising ...", len(snapshot.poses), len(snapshot.edges))
     watch = _Watch()
-    graph = LoadedGraph(snapshot, robust)
+    graph = loaded(snapshot, planar, robust)
     read = watch.state(graph, [])
-    graph = LoadedGraph(GraphSnapshot(best_start(snapshot), snapshot.edges), robust)
-    graph.optimise()
+    graph.optimise(reconsider=True)
     optimum = watch.state(graph, [])
     left = max(round(keep * len(graph)), 1)
     logger.info("Optimised in %.1f s; down to %d vertices ...", optimum.seconds, left)
@@ -95,29 +98,19 @@ def reduce(
     )
 
 
-class LoadedGraph(PoseGraph):
-    """A pose graph that is there as a whole, and didn't grow from its root.
+def loaded(snapshot: GraphSnapshot, planar: bool, robust: bool = True) -> PoseGraph:
+    """Return a pose graph that is there as a whole, and didn't grow from its root.
 
     Vertices keep the poses that they are given, and the lowest of each connected part is held.
+
+    Args:
+        snapshot: not changed.
+        planar: all poses lie in a plane.
+        robust: let loop closures vote; else all count.
     """
-
-    def __init__(self, snapshot: GraphSnapshot, robust: bool = True) -> None:
-        """Take vertices and edges.
-
-        Args:
-            snapshot: not changed.
-            robust: let loop closures vote; else all count.
-        """
-        super().__init__()
-        self._robust = robust
-        self.restore(snapshot.poses, dict(enumerate(snapshot.edges)), solved=False)
-
-    def optimise(self, reconsider: bool = False) -> None:
-        """Find the poses that fit the edges best; see PoseGraph."""
-        if self._robust:
-            super().optimise(reconsider)
-        else:
-            self._solve(self._loops)
+    graph = PoseGraph(planar, trust_closures=not robust)
+    graph.restore(snapshot.poses, dict(enumerate(snapshot.edges)), solved=False)
+    return graph
 
 
 class _Watch:
