@@ -27,7 +27,6 @@ _FREE_ROTATION = 3.0  # rad: what only closures tie to the rest may be turned an
 _FREE_TRANSLATION = 1.0  # and be anywhere: extents of the map
 _ANCHOR_SIGMA = 1e-6  # rad and m
 _TOLERANCE = 1e-5  # relative change of the error at which an optimisation ends
-_CHUNK = 128  # closures whose predictions' covariances are solved for at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +139,7 @@ class ClosureProblem:
     def solve(self, accepted: Iterable[int], start: gtsam.Values) -> tuple[gtsam.Values, float]:
         """Return the optimum with some closures, by index, and its chi-square."""
         params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(50)
+        params.setMaxIterations(20)
         params.setRelativeErrorTol(_TOLERANCE)
         optimiser = gtsam.LevenbergMarquardtOptimizer(self._graph(accepted), start, params)
         values = optimiser.optimize()
@@ -263,11 +262,8 @@ class Linearised:
 
     def spread(self, closures: NDArray[np.int64]) -> Array:
         """Return the (n, d, d) covariances of the predictions of closures."""
-        chunks = [closures[i : i + _CHUNK] for i in range(0, len(closures), _CHUNK)]
-        joints = [self.joint_spread(chunk) for chunk in chunks]
-        return np.concatenate(
-            [joint[np.arange(len(joint)), np.arange(len(joint))] for joint in joints]
-        )
+        joint = self.joint_spread(closures)
+        return joint[np.arange(len(joint)), np.arange(len(joint))]
 
     def _predictions(self, closures: NDArray[np.int64], changes: Array) -> Array:
         """Return (n, d, m) whitened changes of closures' predictions with (C, m) changes of the poses."""

@@ -225,24 +225,35 @@ class _Search:
     ) -> "_Flips":
         """Return those of the closures that make the objective fall when added (1) or dropped (-1).
 
-        Covariances that are estimated from random draws tell which ones may; those are then looked at exactly.
+        Covariances are estimated from random draws first. They are exact where that leaves few to look at, and
+        for what is to be dropped, as dividing by what the others leave open asks for it.
         """
         closures = self._all[asked]
-        spread = around.sampled_spread(_DRAWS)[asked] if len(closures) > _FEW else None
-        if spread is not None:
-            change, _ = _change(around.residuals[closures], spread, sign)
-            change *= _ROUGHLY**-sign
-            closures = closures[self._falls(choice, change, sign)]
+        if len(closures) > _FEW:
+            change, doubt = _change(
+                around.residuals[closures], around.sampled_spread(_DRAWS)[asked], sign
+            )
+            flips = self._falling(choice, closures, change * _ROUGHLY**-sign, doubt, sign)
+            if sign > 0 and len(flips.closures) > _FEW:
+                return self._falling(choice, closures, change, doubt, sign)
+            closures = flips.closures[np.argsort(flips.objective)][:_FEW]
         if not len(closures):
             return _Flips(closures, np.zeros(0), np.zeros(0))
         change, doubt = _change(around.residuals[closures], around.spread(closures), sign)
-        falls = self._falls(choice, change, sign)
-        value = self._objective(choice.chi_square + change, len(choice.accepted) + sign)
-        return _Flips(closures[falls], value[falls], doubt[falls])
+        return self._falling(choice, closures, change, doubt, sign)
 
-    def _falls(self, choice: Choice, change: Array, sign: int) -> NDArray[np.bool_]:
+    def _falling(
+        self,
+        choice: Choice,
+        closures: NDArray[np.int64],
+        change: Array,
+        doubt: Array,
+        sign: int,
+    ) -> "_Flips":
+        """Return those of the closures whose change of chi-square makes the objective fall."""
         value = self._objective(choice.chi_square + change, len(choice.accepted) + sign)
-        return np.asarray(value < choice.objective - _LEAST_GAIN)
+        falls = value < choice.objective - _LEAST_GAIN
+        return _Flips(closures[falls], value[falls], doubt[falls])
 
     def _with_group(self, choice: Choice) -> Choice | None:
         """Add closures that agree with each other, though each alone costs too much."""
