@@ -9,7 +9,8 @@ from lifelong_slam.errors import SourceError
 from lifelong_slam.geometry import exp, log
 from lifelong_slam.graph.edges import chain, reverse
 from lifelong_slam.graph.reduction import LoadedGraph
-from lifelong_slam.io.g2o import planar_poses, read_g2o, write_g2o
+from lifelong_slam.io.g2o import read_g2o, write_g2o
+from lifelong_slam.io.g2o_format import planar_poses
 from lifelong_slam.result import Edge, GraphSnapshot
 
 PLANE = np.ix_([2, 3, 4], [2, 3, 4])  # rotation, x, y

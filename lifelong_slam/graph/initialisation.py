@@ -5,7 +5,7 @@ the best one. Rotations that are found first, by the chordal relaxation, which i
 (Carlone, Tron, Daniilidis and Dellaert, *Initialization techniques for 3D SLAM*, ICRA 2015).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import networkx
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert, log
 from lifelong_slam.graph.pose_graph import INLIER_THRESHOLD
-from lifelong_slam.result import Edge, GraphSnapshot
+from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
 
@@ -81,24 +81,73 @@ def chordal(graph: GraphSnapshot) -> dict[int, Array]:
 
 
 def best_start(graph: GraphSnapshot) -> dict[int, Array]:
-    """Return the graph's own poses or the chordal ones, whichever fit the edges better.
+    """Return the graph's own poses or the chordal ones, whichever fit edges and priors better.
 
     No loop closure counts for more than one that is plainly wrong, so that a few of those don't speak
-    for the poses that they bend.
+    for the poses that they bend. Fixed vertices stay where they are, and parts with priors are also tried
+    where these put them.
     """
-    return min((graph.poses, chordal(graph)), key=lambda poses: _misfit(graph.edges, poses))
+    candidates = (graph.poses, anchored(graph, graph.poses), anchored(graph, chordal(graph)))
+    return min(candidates, key=lambda poses: _misfit(graph, poses))
 
 
-def _misfit(edges: list[Edge], poses: Mapping[int, Array]) -> float:
-    """Return the sum of squared Mahalanobis distances, those of loop closures truncated."""
-    if not edges:
-        return 0.0
-    sources = np.array([poses[edge.source] for edge in edges])
-    targets = np.array([poses[edge.target] for edge in edges])
-    measured = np.array([edge.T_source_target for edge in edges])
-    errors = log(invert(measured) @ invert(sources) @ targets)
-    covariances = np.array([edge.covariance for edge in edges])
+def anchored(graph: GraphSnapshot, poses: dict[int, Array]) -> dict[int, Array]:
+    """Return poses (4, 4) by vertex, each connected part moved to its fixed vertices and priors.
+
+    Parts are moved as they are, to where they fit best, but fixed vertices are then put exactly where the graph
+    has them. A part that has neither stays.
+    """
+    anchors = {prior.vertex: prior.T_map_vertex for prior in graph.priors}
+    anchors |= {vertex: graph.poses[vertex] for vertex in graph.fixed}
+    if not anchors:
+        return poses
+    moved = dict(poses)
+    for part in connected(graph):
+        held = sorted(part & anchors.keys())
+        if held:
+            shift = _best_shift([poses[v] for v in held], [anchors[v] for v in held])
+            moved |= {vertex: shift @ poses[vertex] for vertex in part}
+    return moved | {vertex: graph.poses[vertex] for vertex in graph.fixed}
+
+
+def _best_shift(sources: list[Array], targets: list[Array]) -> Array:
+    """Return the rigid motion (4, 4) that brings N poses nearest to N others, by least squares.
+
+    What is compared are each pose's origin and the ends of its axes, one metre long (Kabsch 1976): with
+    one pose its attitude counts, with many far apart their places do.
+    """
+    frame = np.column_stack([np.zeros(3), np.eye(3)])
+    p, q = (
+        np.concatenate([T[:3, :3] @ frame + T[:3, 3:] for T in poses], axis=1)
+        for poses in (sources, targets)
+    )
+    p_mean, q_mean = p.mean(axis=1, keepdims=True), q.mean(axis=1, keepdims=True)
+    U, _, Vt = np.linalg.svd((q - q_mean) @ (p - p_mean).T)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    shift = np.eye(4)
+    shift[:3, :3], shift[:3, 3:] = R, q_mean - R @ p_mean
+    return shift
+
+
+def _misfit(graph: GraphSnapshot, poses: Mapping[int, Array]) -> float:
+    """Return the sum of squared Mahalanobis distances, those of what can be outvoted truncated."""
+    total = 0.0
+    if graph.edges:
+        sources = np.array([poses[edge.source] for edge in graph.edges])
+        targets = np.array([poses[edge.target] for edge in graph.edges])
+        distances = _distances(graph.edges, invert(sources) @ targets)
+        trusted = np.array([edge.kind == "odometry" for edge in graph.edges])
+        total += np.where(trusted, distances, np.minimum(distances, INLIER_THRESHOLD)).sum()
+    if graph.priors:
+        total += _distances(graph.priors, np.array([poses[p.vertex] for p in graph.priors])).sum()
+    return float(total)
+
+
+def _distances(measurements: Sequence[Edge] | Sequence[Prior], expected: Array) -> Array:
+    """Return the (N,) squared Mahalanobis distances of N measurements from (N, 4, 4) poses."""
+    measured = np.array([m.T_source_target if isinstance(m, Edge) else m.T_map_vertex for m in measurements])
+    errors = log(invert(measured) @ expected)
+    covariances = np.array([measurement.covariance for measurement in measurements])
     whitened = np.linalg.solve(covariances, errors[..., None])[..., 0]
-    distances = np.einsum("ij,ij->i", errors, whitened)
-    loop = np.array([edge.kind == "loop" for edge in edges])
-    return float(np.where(loop, np.minimum(distances, INLIER_THRESHOLD), distances).sum())
+    distances: Array = np.einsum("ij,ij->i", errors, whitened)
+    return distances
