@@ -279,7 +279,7 @@ def test_truth_is_read_from_every_kind_of_file(tmp_path):
         ("", "empty"),
         ("EDGE2 0 1 1 0\n", "line 1: not a valid EDGE2"),
         ("EDGE2 0 1 1 0 0\nEDGE2 5 6 1 0 0\n", "such as 5"),
-        ("VERTEX_SE2 0 1 2 3\n", "lacks 1 vertices, such as 1"),
+        ("VERTEX_SE2 2 1 2 3\n", "lacks 2 of 2 vertices, such as 0"),
         ("0.0 1 2 3 0 0 0 1\n", "1 rows for 2 vertices"),
     ],
 )

@@ -155,10 +155,10 @@ def test_without_reference_a_run_report_shows_path_and_heights(tmp_path):
     assert "Error along the path" not in html
     assert "Position error, Map distance, F score, Time per scan: there is no reference" in html
     trajectories, _, heights = unpacked(html)
-    assert [trace.get("name") for trace in trajectories["data"][:2]] == [
-        "loop closures",
-        "estimate",
-    ]
+    composed, loops, estimate = trajectories["data"][:3]
+    named = [trace.get("name") for trace in (composed, loops, estimate)]
+    assert named == ["composed edges", "loop closures", "estimate"]
+    assert composed["line"]["color"] != loops["line"]["color"]
     assert np.nanmax(array(heights["data"][0]["z"])) > 1
 
 

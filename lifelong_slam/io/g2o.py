@@ -39,7 +39,7 @@ _NO_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n"
 
 
 def write_g2o(path: Path, graph: GraphSnapshot, planar: bool = False) -> None:
-    """Write a pose graph in full precision: vertices by id, those that are fixed, edges, priors.
+    """Write a pose graph in full precision: vertices by id, edges in their order, priors, FIX lines.
 
     Args:
         path: of the file, replaced only once the new one is complete.
@@ -47,14 +47,14 @@ def write_g2o(path: Path, graph: GraphSnapshot, planar: bool = False) -> None:
         planar: write the planar part of all poses and covariances, as SE(2).
 
     Raises:
-        ValueError: the covariance of an edge or prior is singular.
+        ValueError: a covariance is singular.
     """
     form = SE2 if planar else SE3
     lines = [
         *_vertex_lines(graph, form),
-        *(f"FIX {vertex}\n" for vertex in graph.fixed),
         *_edge_lines(graph.edges, form),
         *_prior_lines(graph.priors, form),
+        *(f"FIX {vertex}\n" for vertex in graph.fixed),  # where GTSAM's reader of SE(2) stops
     ]
     with atomic_write(path) as file:
         for line in lines:
@@ -124,7 +124,7 @@ def _measurements(poses: Array, covariances: Array, form: Format) -> list[str]:
     try:
         information = form.information(covariances)
     except np.linalg.LinAlgError as error:
-        raise ValueError("an edge's covariance is singular") from error
+        raise ValueError("the covariance of an edge or prior is singular") from error
     upper = information[:, *np.triu_indices(len(form.order))]
     return [_join(row) for row in np.hstack([form.pack(poses), upper])]
 
