@@ -42,9 +42,9 @@ class GraphSketch:
 def read_graph(path: Path) -> GraphSketch:
     """Read vertices and edges of a g2o file, SE(3) or SE(2); FIX lines and priors are skipped.
 
-    Comments ``# odometry``, ``# loop`` and ``# composed`` name the kind of edges: on a line of their own of those
-    after it, at the end of an edge's line of that edge. Without them, an edge between vertices that
-    follow each other by id counts as odometry and any other as a loop closure.
+    Comments ``# odometry``, ``# loop`` and ``# composed`` name the kind of edges: on a line of their own
+    of those after it, at the end of an edge's line of that edge. Without them, an edge between vertices
+    that follow each other by id counts as odometry and any other as a loop closure.
 
     Raises:
         FileError: the file is missing, or a line is malformed.

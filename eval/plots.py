@@ -149,9 +149,7 @@ def _draw_edges(axes: Axes, ends: Array, colour: str, name: str) -> None:
     """Draw edges between (E, 2, 3) vertices as straight lines."""
     if len(ends) == 0:
         return
-    lines = LineCollection(
-        list(ends[:, :, :2]), colors=colour, linewidths=1.0, alpha=0.7, zorder=3
-    )
+    lines = LineCollection(list(ends[:, :, :2]), colors=colour, linewidths=1.0, alpha=0.7, zorder=3)
     axes.add_collection(lines)
     middles = ends.mean(axis=1)
     label = f"{len(ends)} {name}{'' if len(ends) == 1 else 's'}"

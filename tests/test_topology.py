@@ -1,5 +1,7 @@
 """Which edges count as odometry where a file doesn't say so."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ SYMBOLS = (ord("a") << 56, ord("b") << 56)
 def drive(first=0, count=60, spacing=1):
     """Odometry and closures, each to the lap before, of a robot whose ids begin somewhere."""
     ids = [first + spacing * i for i in range(count)]
-    odometry = list(zip(ids, ids[1:]))  # noqa: B905 - the last id has no successor
+    odometry = list(pairwise(ids))
     return ids, odometry, [(ids[i], ids[i - LAP]) for i in range(LAP, count, 3)]
 
 
@@ -59,7 +61,7 @@ def test_of_parallel_edges_the_first_is_odometry():
 
 def test_gaps_that_pruning_leaves_are_no_jumps():
     kept = sorted(np.random.default_rng(1).choice(300, 100, replace=False).tolist())
-    chain = list(zip(kept, kept[1:]))  # noqa: B905
+    chain = list(pairwise(kept))
     missing = [chain.pop(k) for k in (70, 30)]  # ends that pruning joined to others only
     closures = [(kept[i], kept[i - 33]) for i in range(33, 100, 5)]
     found = odometry_of([*chain, *closures], kept)

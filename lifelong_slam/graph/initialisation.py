@@ -94,8 +94,8 @@ def best_start(graph: GraphSnapshot) -> dict[int, Array]:
 def anchored(graph: GraphSnapshot, poses: dict[int, Array]) -> dict[int, Array]:
     """Return poses (4, 4) by vertex, each connected part moved to its fixed vertices and priors.
 
-    Parts are moved as they are, to where they fit best, but fixed vertices are then put exactly where the graph
-    has them. A part that has neither stays.
+    Parts are moved as they are, to where they fit best, but fixed vertices are then put exactly where the
+    graph has them. A part that has neither stays.
     """
     anchors = {prior.vertex: prior.T_map_vertex for prior in graph.priors}
     anchors |= {vertex: graph.poses[vertex] for vertex in graph.fixed}
@@ -145,7 +145,9 @@ def _misfit(graph: GraphSnapshot, poses: Mapping[int, Array]) -> float:
 
 def _distances(measurements: Sequence[Edge] | Sequence[Prior], expected: Array) -> Array:
     """Return the (N,) squared Mahalanobis distances of N measurements from (N, 4, 4) poses."""
-    measured = np.array([m.T_source_target if isinstance(m, Edge) else m.T_map_vertex for m in measurements])
+    measured = np.array(
+        [m.T_source_target if isinstance(m, Edge) else m.T_map_vertex for m in measurements]
+    )
     errors = log(invert(measured) @ expected)
     covariances = np.array([measurement.covariance for measurement in measurements])
     whitened = np.linalg.solve(covariances, errors[..., None])[..., 0]

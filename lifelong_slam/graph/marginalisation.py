@@ -60,12 +60,12 @@ class StarMesh:
     Each weaker arm is chained to a strong one, whose uncertainty hardly counts beside its own. An edge
     between two that have one already is fused with it.
 
-    An edge that any loop closure went into is composed, and the graph can outvote it as it can a closure.
-    Odometry is also combined with odometry alone, so that the path of odometry through all vertices remains: it
-    keeps the graph connected whatever is outvoted.
+    An edge that any loop closure went into is composed, and the graph can outvote it as it can a
+    closure. Odometry is also combined with odometry alone, so that the path of odometry through all
+    vertices remains: it keeps the graph connected whatever is outvoted.
 
-    A vertex that ends up with too many edges loses those that are worth least, odometry never: edges between
-    vertices that a third one ties together more firmly than they do.
+    A vertex that ends up with too many edges loses those that are worth least, but no odometry: those
+    between vertices that a third one ties together more firmly than they do.
 
     Attributes:
         arms: how many of the strongest arms are meshed.

@@ -192,7 +192,7 @@ class PoseGraph:
         """Forget a vertex and all edges that meet in it, and return those.
 
         Raises:
-            ValueError: without the vertex its component has no place: it is a root, is fixed or has a prior.
+            ValueError: the vertex is a root, is fixed or has a prior: without it others have no place.
         """
         if vertex in self._roots or vertex in self._fixed or self._has_prior(vertex):
             raise ValueError(f"vertex {vertex} holds its component in place")

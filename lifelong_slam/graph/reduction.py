@@ -109,8 +109,8 @@ def _warn_of_a_lost_vote(state: State) -> None:
     every = state.loops + state.composed + state.rejected
     if 2 * state.rejected > every:
         logger.warning(
-            "warning: %d of %d loop closures are outvoted%s; if most of them are true, odometry is less sure"
-            " than it claims to be (robust=false trusts them all)",
+            "warning: %d of %d loop closures are outvoted%s; if most of them are true, odometry is less"
+            " sure than it claims to be (robust=false trusts them all)",
             state.rejected,
             every,
             ", and only odometry is left" if state.rejected == every else "",

@@ -4,16 +4,16 @@ Odometry makes paths: it leads from each vertex of a trajectory to the next. So 
 from the order of the vertices, whichever way round the edges are written and in whichever order:
 
 1. Vertices that follow each other by id are a step, if an edge joins them and their ids aren't further
-   apart than `_JUMP` times the usual (median) gap. Beyond that another trajectory begins: 99 and 1000, or
-   GTSAM's symbols, which have the robot's letter in the highest byte.
-2. If these steps lead to less than half of the vertices, ids aren't in the order of the drive. Vertices that
-   follow each other in the file are steps then, if an edge joins them;
-3. or, if there are fewer than half of these as well, the edges that lengthen a path by a new vertex,
-   in the order of the file.
+   apart than `_JUMP` times the usual (median) gap. Beyond that another trajectory begins: 99 and 1000,
+   or GTSAM's symbols, which have the robot's letter in the highest byte.
+2. If these steps lead to less than half of the vertices, ids aren't in the order of the drive. Steps are
+   then between vertices that follow each other in the file, if an edge joins them;
+3. or, if these lead to less than half as well, along the edges that lengthen a path by a new vertex, in
+   the order of the file.
 
 Of several edges between the ends of a step the first is odometry. All other edges are loop closures: a
-second measurement between neighbours can be wrong where odometry isn't, for instance one of scan matching,
-and as a closure it can be outvoted.
+second measurement between neighbours can be wrong where odometry isn't, for instance one of scan
+matching, and as a closure it can be outvoted.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ def _successive_ids(ids: list[int]) -> set[Pair]:
 
 
 def _growth(ends: Sequence[Pair]) -> set[Pair]:
-    """Return the pairs that begin a path of two new vertices or lengthen one, at its end, by a new vertex."""
+    """Return the pairs that begin a path of two new vertices or lengthen one at its end by a new one."""
     steps: set[Pair] = set()
     neighbours: dict[int, int] = {}  # of each vertex that was seen, along its path
     for pair in ends:

@@ -16,10 +16,10 @@ SE(3) of a sensor whose pose on the vertex is ``PARAMS_SE3OFFSET offset``. Prior
 (``EDGE_PRIOR_SE2_XY``, ``EDGE_SE3_XYZPRIOR``, hdl_graph_slam's ``EDGE_SE3_PRIORXYZ`` and RTAB-Map's
 ``EDGE_POINTXYZ_PRIOR``) become such ones that know nothing of the attitude.
 
-The format has no place for an edge's kind. A comment, ``# odometry``, ``# loop`` or ``# composed``, names it:
-on a line of its own for all edges after it, or at the end of an edge's line for that edge. SE(3) files have the
-former. SE(2) files have the latter, since GTSAM's reader of those stops, without a word, at a line of
-comment. Edges that nothing names are told apart by topology.py.
+The format has no place for an edge's kind. A comment, ``# odometry``, ``# loop`` or ``# composed``,
+names it: on a line of its own for all edges after it, or at the end of an edge's line for that edge. SE(3)
+files have the former. SE(2) files have the latter, since GTSAM's reader of those stops, without a word,
+at a line of comment. Edges that nothing names are told apart by topology.py.
 """
 
 from pathlib import Path
@@ -64,9 +64,9 @@ def write_g2o(path: Path, graph: GraphSnapshot, planar: bool = False) -> None:
 def read_g2o(path: Path) -> FileGraph:
     """Read the vertices, edges, priors and fixed vertices of a g2o file.
 
-    In a file that has no vertices, poses are chained from the edges, odometry as far as it goes. Information
-    that isn't positive definite is made so (see g2o_format.py), edges without any are left out; a warning
-    counts either.
+    In a file that has no vertices, poses are chained from the edges, odometry as far as it goes.
+    Information that isn't positive definite is made so (see g2o_format.py), edges without any are left
+    out; a warning counts either.
 
     Raises:
         SourceError: the file is missing; a line is malformed or of a type that isn't a pose or a motion;

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from lifelong_slam.geometry import adjoint, invert
 from lifelong_slam.graph.initialisation import chained
 from lifelong_slam.graph.topology import edge_kinds
-from lifelong_slam.io.g2o_format import SE2, SE3, Format, made_definite, symmetric, without_information
+from lifelong_slam.io.g2o_format import (
+    SE2,
+    SE3,
+    Format,
+    made_definite,
+    symmetric,
+    without_information,
+)
 from lifelong_slam.result import Edge, EdgeKind, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
@@ -183,12 +190,11 @@ class Lines:
             return []
         ids = list(self._vertices) or list(dict.fromkeys(i for row in rows for i in row.ids))
         unnamed = [(row.ids[0], row.ids[1]) for row in rows if row.kind is None]
-        kinds = iter(edge_kinds(unnamed, ids))
+        told = iter(edge_kinds(unnamed, ids))
+        kinds = [next(told) if row.kind is None else row.kind for row in rows]
+        measured = zip(_unpacked(form, rows), form.covariance(information), kinds, strict=True)
         return [
-            Edge(row.ids[0], row.ids[1], T, C, row.kind or next(kinds))
-            for row, T, C in zip(
-                rows, _unpacked(form, rows), form.covariance(information), strict=True
-            )
+            Edge(row.ids[0], row.ids[1], *rest) for row, rest in zip(rows, measured, strict=True)
         ]
 
     def _priors(self, form: Format) -> list[Prior]:
@@ -249,7 +255,7 @@ class Lines:
         wanted = [row.ids[1] if len(row.ids) > 1 else None for row in rows]
         missing = {i for i in wanted if i is not None} - known.keys()
         if missing:
-            text = "PARAMS_SE3OFFSET %d is missing (and %d others): priors are taken to be of the vertex itself"
+            text = "PARAMS_SE3OFFSET %d is missing (and %d others): these priors count as of the vertex"
             self._warn(text, min(missing), len(missing) - 1)
         return np.array([known.get(-1 if i is None else i, np.eye(4)) for i in wanted])
 
@@ -257,9 +263,7 @@ class Lines:
         logger.warning("%s: " + text, self._name, *values)
 
 
-def _row(
-    line: int, tag: str, fields: list[str], record: _Record, kind: EdgeKind | None
-) -> _Row:
+def _row(line: int, tag: str, fields: list[str], record: _Record, kind: EdgeKind | None) -> _Row:
     """Read the fields of a line."""
     count = record.ids + record.numbers
     if len(fields) != count:

@@ -18,7 +18,9 @@ from lifelong_slam.files import atomic_path
 
 _APPLICATION = 0x4C534C4D  # "LSLM"
 _SCHEMA_VERSION = 2
-_OLDEST_VERSION = 1  # it has the same tables, but no composed edges: such count as loop closures there
+_OLDEST_VERSION = (
+    1  # it has the same tables, but no composed edges: such count as loop closures there
+)
 _SECONDS_TO_WAIT = 0.5  # for others, who may need the file for a moment only
 
 _EDGES = """
