@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 _LOOP_WEIGHT = 1e9  # more than there are odometry edges: closures come in only where odometry ends
 
+_WIDEST = 1e8  # variance in the chordal relaxation, relative to the least
+
 
 def connected(graph: GraphSnapshot) -> list[set[int]]:
     """Return the sets of vertices that edges connect, by their lowest vertex."""
@@ -59,13 +61,9 @@ def chordal(graph: GraphSnapshot) -> dict[int, Array]:
 
     The lowest vertex of each connected part keeps its pose.
     """
-    # Only the ratios of the covariances matter; more information than GTSAM gives its anchor, which is
-    # the identity, would make the system ill-conditioned.
-    covariances = np.array([edge.covariance for edge in graph.edges])
-    scale = 1 / np.linalg.eigvalsh(covariances).min()
     factors = gtsam.NonlinearFactorGraph()
-    for edge in graph.edges:
-        noise = gtsam.noiseModel.Gaussian.Covariance(scale * edge.covariance)
+    for edge, covariance in zip(graph.edges, _conditioned(graph.edges), strict=True):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         measured = gtsam.Pose3(edge.T_source_target)
         factors.push_back(gtsam.BetweenFactorPose3(edge.source, edge.target, measured, noise))
     parts = connected(graph)
@@ -78,6 +76,18 @@ def chordal(graph: GraphSnapshot) -> dict[int, Array]:
         shift = graph.poses[min(part)] @ invert(poses[min(part)])
         poses |= {vertex: shift @ poses[vertex] for vertex in part}
     return poses
+
+
+def _conditioned(edges: list[Edge]) -> Array:
+    """Return (N, 6, 6) covariances for the relaxation, of which only the ratios matter.
+
+    More information than GTSAM gives its anchor, which is the identity, would make the system
+    ill-conditioned, and so would edges that know hardly anything of some direction.
+    """
+    variances, V = np.linalg.eigh(np.array([edge.covariance for edge in edges]))
+    bounded = np.minimum(variances / variances.min(), _WIDEST)
+    covariances: Array = (V * bounded[:, None]) @ np.swapaxes(V, 1, 2)
+    return covariances
 
 
 def best_start(graph: GraphSnapshot) -> dict[int, Array]:

@@ -140,8 +140,8 @@ class Lines:
             self._warn("%d lines %s are left out: such a prior can't be used", count, tag)
         self._check_ends()
         edges = self._edges(self._form)
-        poses = self._poses(self._form) if self._vertices else chained(edges)
-        self._check_priors(poses)
+        poses = self._poses(self._form) if self._vertices else chained(edges) if edges else {}
+        self._check_held(poses)
         priors = self._priors(self._form) + self._positions(self._form, poses)
         return FileGraph(poses, edges, self._held(), tuple(priors), planar=self._form.planar)
 
@@ -168,7 +168,7 @@ class Lines:
             if missing:
                 raise LineError(row.line, f"there is no vertex {missing[0]}")
 
-    def _check_priors(self, poses: dict[int, Array]) -> None:
+    def _check_held(self, poses: dict[int, Array]) -> None:
         rows = [*self._rows[_Role.PRIOR], *self._rows[_Role.POSITION]]
         for vertex, line in ({row.ids[0]: row.line for row in rows} | self._fixed).items():
             if vertex not in poses:
