@@ -291,6 +291,17 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, content, message):
         read_truth(tmp_path / "truth.txt", [0, 1])
 
 
+@pytest.mark.parametrize("ratio", [1e9, 1e11])
+def test_edges_that_hardly_know_the_attitude_have_a_start(ratio):
+    graph, _ = laps(planar=True)
+    loose = np.diag([1e-6 * ratio] * 3 + [1e-6] * 3)
+    edges = [Edge(e.source, e.target, e.T_source_target, loose, e.kind) for e in graph.edges]
+    poses = chordal(GraphSnapshot(graph.poses, edges))
+    assert np.isfinite(list(poses.values())).all()
+    result = reduce(GraphSnapshot(graph.poses, edges), NoPruning(), keep=1.0)
+    assert result.optimum.chi_square < result.read.chi_square
+
+
 def held_optimum(graph, start):
     """GTSAM's own optimum, fixed vertices being equality constraints: (4, 4) poses by vertex."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _LOOP_WEIGHT = 1e9  # more than there are odometry edges: closures come in only where odometry ends
 
-_WIDEST = 1e8  # variance in the chordal relaxation, relative to the least
+_WIDEST = 1e6  # variance in the chordal relaxation, relative to the least
 
 
 def connected(graph: GraphSnapshot) -> list[set[int]]:

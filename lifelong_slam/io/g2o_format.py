@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SINGULAR = 1e-12  # least eigenvalue of an information matrix, relative to its greatest
-_HARDLY_KNOWN = 1e-9  # likewise, of what a matrix that isn't positive definite doesn't know
+_HARDLY_KNOWN = 1e-6  # likewise, in one that wasn't positive definite
 _OUT_OF_PLANE = [0, 1, 5]  # roll, pitch and z in GTSAM's order
 
 
@@ -93,23 +93,42 @@ def without_information(information: Array) -> Mask:
     return nothing
 
 
-def made_definite(information: Array) -> tuple[Array, Mask]:
+def made_definite(information: Array, axes: int) -> tuple[Array, Mask]:
     """Return (N, n, n) positive definite information matrices, and (N,) which of them weren't.
 
     Such a one is replaced by the nearest that is positive semidefinite: eigenvalues below zero become zero
     (Higham, *Computing a nearest symmetric positive semidefinite matrix*, 1988). Those near zero are then
-    raised to a billionth of the greatest, so that there is a covariance: what the matrix doesn't know
-    hardly counts.
+    raised to a millionth, so that there is a covariance: what the matrix doesn't know hardly counts. All
+    that is in units of the most that the matrix knows about the position, and about the attitude.
 
     Args:
         information: symmetric, of positive trace.
+        axes: rows that are about the position, the first.
     """
-    eigenvalues, V = np.linalg.eigh(information)
-    greatest = eigenvalues[:, -1:]
-    bad: Mask = eigenvalues[:, 0] <= _SINGULAR * greatest[:, 0]
-    raised = np.maximum(eigenvalues, _HARDLY_KNOWN * greatest)
-    definite = (V * raised[:, None]) @ np.swapaxes(V, 1, 2)
-    return np.where(bad[:, None, None], definite, information), bad
+    eigenvalues = np.linalg.eigvalsh(information)
+    bad: Mask = eigenvalues[:, 0] <= _SINGULAR * eigenvalues[:, -1]
+    units = _units(information[bad], axes)
+    products = units[:, :, None] * units[:, None]
+    eigenvalues, V = np.linalg.eigh(information[bad] / products)
+    raised = np.maximum(eigenvalues, _HARDLY_KNOWN * eigenvalues[:, -1:])
+    definite = information.copy()
+    definite[bad] = (V * raised[:, None]) @ np.swapaxes(V, 1, 2) * products
+    return definite, bad
+
+
+def _units(information: Array, axes: int) -> Array:
+    """Return for each row of (N, n, n) matrices the root of the most that is known of its kind.
+
+    Where nothing is known of one kind the other's unit takes its place: a radian for a metre.
+    """
+    known: Array = np.zeros(information.shape[:2])
+    for kind in (slice(None, axes), slice(axes, None)):
+        block = information[:, kind, kind]
+        if block.size:
+            known[:, kind] = np.linalg.eigvalsh(block)[:, -1:]
+    most = known.max(axis=1, keepdims=True)
+    units: Array = np.sqrt(np.where(known > _SINGULAR * most, known, most))
+    return units
 
 
 def planar_poses(values: Array) -> Array:

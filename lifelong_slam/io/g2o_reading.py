@@ -219,7 +219,7 @@ class Lines:
         R = T[:, :n, :n]
         information = np.zeros((len(rows), len(form.order), len(form.order)))
         information[:, :n, :n] = np.swapaxes(R, 1, 2) @ known @ R
-        C = form.covariance(made_definite(information)[0])
+        C = form.covariance(made_definite(information, n)[0])
         return [Prior(row.ids[0], *prior) for row, *prior in zip(rows, T, C, strict=True)]
 
     def _informed(
@@ -237,7 +237,7 @@ class Lines:
             first = rows[int(nothing.argmax())].line
             text = "%d of %d %s, the first in line %d, have no information and are left out"
             self._warn(text, len(rows) - len(kept), len(rows), what, first)
-        definite, bad = made_definite(information[~nothing])
+        definite, bad = made_definite(information[~nothing], form.axes)
         if bad.any():
             text = (
                 "the information of %d of %d %s, the first in line %d, isn't positive definite:"
