@@ -371,6 +371,29 @@ def test_priors_pull_their_part_to_where_they_measured_it(start):
     assert result.complete
 
 
+@pytest.mark.parametrize("turn", [0.0, 2.5, 3.1])
+@pytest.mark.parametrize("planar", [True, False])
+def test_priors_of_positions_put_a_graph_where_they_measured_it(tmp_path, planar, turn):
+    """Their map is turned and far away: the attitude at the start says nothing."""
+    path, _ = write_laps(tmp_path, planar=planar)
+    _, truth = laps(planar=planar)
+    shift = exp(np.array([0.0, 0.0, turn, 0.0, 0.0, 0.0]))
+    shift[:3, 3] = [4.5e5, 5.4e6, 0.0 if planar else 120.0]
+    rng = np.random.default_rng(1)
+    with path.open("a") as file:
+        for i in range(0, 60, 7):
+            x, y, z = (shift @ truth[i])[:3, 3] + 0.1 * rng.normal(size=3)
+            file.write(
+                f"EDGE_PRIOR_SE2_XY {i} {x} {y} 100 0 100\n"
+                if planar
+                else f"EDGE_SE3_PRIORXYZ {i} {x} {y} {z} 100 0 0 100 0 100\n"
+            )
+    result = reduce(read_g2o(path), NoPruning(), keep=1.0).optimum
+    assert result.rejected == 0
+    errors = [np.linalg.norm((result.poses[i] - shift @ truth[i])[:3, 3]) for i in truth]
+    assert rmse(np.array(errors)) < 0.1
+
+
 def test_a_part_without_priors_stays_where_it_is():
     graph, _ = laps(count=1)
     far = exp(np.array([0.0, 0.0, 0.0, 100.0, 0.0, 0.0]))

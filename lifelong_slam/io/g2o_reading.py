@@ -202,7 +202,7 @@ class Lines:
         if not rows:
             return []
         # The offset is the sensor's pose on the vertex; the prior is about the sensor.
-        offsets = self._offsets(rows)
+        offsets = np.eye(4)[None] if form.planar else self._offsets(rows)
         A = adjoint(offsets)
         T = _unpacked(form, rows) @ invert(offsets)
         C = A @ form.covariance(information) @ np.swapaxes(A, 1, 2)
@@ -248,16 +248,14 @@ class Lines:
 
     def _offsets(self, rows: list[_Row]) -> Array:
         """Return the (N, 4, 4) sensor's poses on the vertex, by the second id of each row."""
-        known: dict[int, Array] = {}
-        if self._rows[_Role.OFFSET]:
-            defined = self._rows[_Role.OFFSET]
-            known = dict(zip([r.ids[0] for r in defined], _unpacked(SE3, defined), strict=True))
-        wanted = [row.ids[1] if len(row.ids) > 1 else None for row in rows]
-        missing = {i for i in wanted if i is not None} - known.keys()
+        defined = self._rows[_Role.OFFSET]
+        poses = _unpacked(SE3, defined) if defined else ()
+        known = {row.ids[0]: T for row, T in zip(defined, poses, strict=True)}
+        missing = {row.ids[1] for row in rows} - known.keys()
         if missing:
-            text = "PARAMS_SE3OFFSET %d is missing (and %d others): these priors count as of the vertex"
-            self._warn(text, min(missing), len(missing) - 1)
-        return np.array([known.get(-1 if i is None else i, np.eye(4)) for i in wanted])
+            text = "PARAMS_SE3OFFSET %d is missing (%d in all): these priors count as of the vertex"
+            self._warn(text, min(missing), len(missing))
+        return np.array([known.get(row.ids[1], np.eye(4)) for row in rows])
 
     def _warn(self, text: str, *values: object) -> None:
         logger.warning("%s: " + text, self._name, *values)
