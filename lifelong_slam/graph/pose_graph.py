@@ -7,8 +7,8 @@ in which a true closure may move the map by metres, and sharpens until each clos
 
 Vertices can be removed: what their edges said is then put in by whoever removes them (marginalisation.py).
 A graph may have several components, one for each session that hasn't been located in the map; each is
-held by its root, the vertex that was added without an edge. Fixed vertices and priors, which graphs from files
-may have, hold theirs instead.
+held by its root, the vertex that was added without an edge. In graphs from files, fixed vertices and
+priors hold theirs instead.
 """
 
 import logging
