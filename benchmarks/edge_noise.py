@@ -34,11 +34,11 @@ def measure(overrides: Sequence[str]) -> dict[EdgeKind, Array]:
     reference = source.reference()
     stamps = np.clip(result.trajectory.stamps[keyframes], None, reference.stamps[-1])
     truth = reference.at(stamps) @ source.T_base_sensor
-    errors: dict[EdgeKind, list[Array]] = {"odometry": [], "loop": []}
+    errors: dict[EdgeKind, list[Array]] = {"odometry": [], "loop": [], "composed": []}
     for edge in result.graph.edges:
         motion = invert(truth[edge.source]) @ truth[edge.target]
         errors[edge.kind].append(log(invert(motion) @ edge.T_source_target))
-    return {kind: np.array(values) for kind, values in errors.items()}
+    return {kind: np.array(values) for kind, values in errors.items() if values}
 
 
 def main() -> None:

@@ -29,7 +29,8 @@ from eval.vertices import Array, rmse, vertex_distances
 from lifelong_slam.config import build
 from lifelong_slam.graph.pruning import NoPruning, Pruning
 from lifelong_slam.graph.reduction import Reduction, reduce
-from lifelong_slam.io.g2o import FileGraph, read_g2o
+from lifelong_slam.io.g2o import read_g2o
+from lifelong_slam.io.g2o_reading import FileGraph
 from lifelong_slam.io.graph_truth import read_truth
 from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything

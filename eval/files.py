@@ -18,6 +18,9 @@ from eval.errors import FileError
 
 Timeline = dict[str, NDArray[np.float64]]
 
+_AXES = {"VERTEX_SE3:QUAT": 3, "VERTEX_SE2": 2}  # coordinates of a vertex's position
+_KINDS = ("odometry", "loop", "composed")
+
 
 @dataclass(frozen=True, slots=True)
 class GraphSketch:
@@ -27,18 +30,21 @@ class GraphSketch:
         positions: (V, 3) positions of the vertices in metres.
         edges: (E, 2) indices into `positions`.
         is_loop: (E,) whether an edge closes a loop.
+        is_composed: (E,) whether it is made of several measurements, loop closures among them.
     """
 
     positions: NDArray[np.float64]
     edges: NDArray[np.int64]
     is_loop: NDArray[np.bool_]
+    is_composed: NDArray[np.bool_]
 
 
 def read_graph(path: Path) -> GraphSketch:
-    """Read vertices and edges of an SE(3) g2o file.
+    """Read vertices and edges of a g2o file, SE(3) or SE(2); FIX lines and priors are skipped.
 
-    Comment lines ``# odometry`` and ``# loop`` name the kind of the edges after them. Without them,
-    an edge to the vertex with the next id counts as odometry and any other as a loop closure.
+    Comments ``# odometry``, ``# loop`` and ``# composed`` name the kind of edges: on a line of their own
+    of those after it, at the end of an edge's line of that edge. Without them, an edge between vertices
+    that follow each other by id counts as odometry and any other as a loop closure.
 
     Raises:
         FileError: the file is missing, or a line is malformed.
@@ -48,14 +54,17 @@ def read_graph(path: Path) -> GraphSketch:
     edges: list[tuple[int, int, str]] = []
     kind = ""
     for number, line in enumerate(path.read_text().splitlines(), 1):
-        tag, *fields = line.split() or [""]
+        content, _, comment = line.partition("#")
+        tag, *fields = content.split() or [""]
+        named = comment.strip() if comment.strip() in _KINDS else kind
         try:
-            if tag == "VERTEX_SE3:QUAT":
-                positions[int(fields[0])] = [float(field) for field in fields[1:4]]
-            elif tag == "EDGE_SE3:QUAT":
-                edges.append((int(fields[0]), int(fields[1]), kind))
-            elif tag == "#" and fields in (["odometry"], ["loop"]):
-                kind = fields[0]
+            if tag in _AXES:
+                place = [float(field) for field in fields[1 : 1 + _AXES[tag]]]
+                positions[int(fields[0])] = [*place, 0.0][:3]
+            elif tag in ("EDGE_SE3:QUAT", "EDGE_SE2"):
+                edges.append((int(fields[0]), int(fields[1]), named))
+            elif not tag:
+                kind = named
         except (ValueError, IndexError) as error:
             raise FileError(f"{path}, line {number}: not a valid {tag}") from error
     return _sketch(path, positions, edges)
@@ -127,9 +136,9 @@ def _sketch(
         raise FileError(f"{path}: edges refer to {len(unknown)} vertices that are not there")
     pairs = np.array([(index[s], index[t]) for s, t, _ in edges], dtype=np.int64).reshape(-1, 2)
     named = np.array([kind for *_, kind in edges], dtype="U8")
-    is_loop = np.where(named == "", pairs[:, 1] - pairs[:, 0] != 1, named == "loop")
+    is_loop = np.where(named == "", np.abs(pairs[:, 1] - pairs[:, 0]) != 1, named == "loop")
     points = np.array([positions[i] for i in ids], dtype=np.float64).reshape(-1, 3)
-    return GraphSketch(points, pairs, is_loop)
+    return GraphSketch(points, pairs, is_loop, named == "composed")
 
 
 def _require(path: Path, what: str) -> None:

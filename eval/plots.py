@@ -22,7 +22,7 @@ from eval.trajectory import TrajectoryComparison
 
 Array = NDArray[np.float64]
 
-_ESTIMATE, _REFERENCE, _LOOP = "#1668b3", "#6b6f76", "#e8590c"
+_ESTIMATE, _REFERENCE, _LOOP, _COMPOSED = "#1668b3", "#6b6f76", "#e8590c", "#9c36b5"
 _COLOURS = ("#1668b3", "#e8590c", "#2b8a3e", "#9c36b5", "#c92a2a", "#0b7285")
 _STACKED = 300  # steps that a stack of curves has on paper
 _WIDTH = 9.0  # inches
@@ -41,7 +41,7 @@ def save(figure: Figure, path: Path) -> None:
 def trajectory(
     estimate: PoseTrajectory3D, comparison: TrajectoryComparison | None, graph: GraphSketch | None
 ) -> Figure:
-    """Draw the path from above, with reference and loop closures, over its height profile."""
+    """Draw the path from above, with reference and what closes loops, over its height profile."""
     path = estimate.positions_xyz
     title = f"Trajectory, {estimate.path_length:.0f} m; no reference"
     if comparison is not None:
@@ -63,7 +63,9 @@ def trajectory(
         vertices = graph.positions
         if comparison is not None:
             vertices = comparison.alignment.move(vertices)
-        _draw_loops(above, vertices, graph)
+        composed, loops = graph.edges[graph.is_composed], graph.edges[graph.is_loop]
+        _draw_edges(above, vertices[composed], _COMPOSED, "composed edge")
+        _draw_edges(above, vertices[loops], _LOOP, "loop closure")
     above.plot(*path[0, :2], "o", ms=8, color=_ESTIMATE, mec="white", mew=1.5, label="start")
     above.plot(*path[-1, :2], "s", ms=7, color=_ESTIMATE, mec="white", mew=1.5, label="end")
     above.set_aspect("equal", adjustable="datalim")
@@ -143,23 +145,15 @@ def map_from_above(points: Points, path: Array) -> Figure:
     return figure
 
 
-def _draw_loops(axes: Axes, vertices: Array, graph: GraphSketch) -> None:
-    """Draw loop closures as straight lines between their vertices."""
-    loops = graph.edges[graph.is_loop]
-    if len(loops) == 0:
+def _draw_edges(axes: Axes, ends: Array, colour: str, name: str) -> None:
+    """Draw edges between (E, 2, 3) vertices as straight lines."""
+    if len(ends) == 0:
         return
-    plural = "" if len(loops) == 1 else "s"
-    lines = LineCollection(
-        list(vertices[loops][:, :, :2]),
-        colors=_LOOP,
-        linewidths=1.0,
-        alpha=0.7,
-        zorder=3,
-    )
+    lines = LineCollection(list(ends[:, :, :2]), colors=colour, linewidths=1.0, alpha=0.7, zorder=3)
     axes.add_collection(lines)
-    middles = vertices[loops].mean(axis=1)
-    label = f"{len(loops)} loop closure{plural}"
-    axes.plot(middles[:, 0], middles[:, 1], "o", ms=3.5, color=_LOOP, zorder=3, label=label)
+    middles = ends.mean(axis=1)
+    label = f"{len(ends)} {name}{'' if len(ends) == 1 else 's'}"
+    axes.plot(middles[:, 0], middles[:, 1], "o", ms=3.5, color=colour, zorder=3, label=label)
 
 
 def _along(path: Array) -> Array:

@@ -183,7 +183,7 @@ def _graph(count: int) -> GraphSketch:
     edges = np.vstack([chain, [[0, count - 1]]]) if count > 2 else np.zeros((0, 2), dtype=np.int64)
     positions = np.arange(3 * count, dtype=np.float64).reshape(count, 3)
     is_loop = np.arange(len(edges)) == len(edges) - 1
-    return GraphSketch(positions, edges, is_loop)
+    return GraphSketch(positions, edges, is_loop, np.zeros_like(is_loop))
 
 
 def _timeline(stamps: Array) -> dict[str, Array]:

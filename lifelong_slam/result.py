@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.trajectory import Trajectory
 
-EdgeKind = Literal["odometry", "loop"]
+EdgeKind = Literal["odometry", "loop", "composed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,8 @@ class Edge:
         T_source_target: (4, 4) pose of the target in the source's frame.
         covariance: (6, 6), tangent order rotation (rad) then translation (m), in the target's frame
             (GTSAM's convention for a BetweenFactor).
-        kind: odometry, or loop closure.
+        kind: odometry; a loop closure; or composed of several measurements, of which at least one was a
+            closure. What isn't odometry can be outvoted.
     """
 
     source: int
@@ -32,16 +33,35 @@ class Edge:
 
 
 @dataclass(frozen=True, slots=True)
+class Prior:
+    """A measured pose of a vertex in the map frame, of GPS or a surveyed point for example.
+
+    Attributes:
+        vertex: that was measured.
+        T_map_vertex: (4, 4) its measured pose.
+        covariance: (6, 6), tangent order rotation (rad) then translation (m), in the vertex's frame.
+    """
+
+    vertex: int
+    T_map_vertex: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
 class GraphSnapshot:
     """Vertices and edges of a pose graph at one moment.
 
     Attributes:
         poses: T_map_vertex (4, 4) by vertex id.
         edges: measurements between them; rejected loop closures are not among them.
+        fixed: vertices that stay exactly where they are.
+        priors: measured poses of vertices.
     """
 
     poses: dict[int, NDArray[np.float64]]
     edges: list[Edge]
+    fixed: tuple[int, ...] = ()
+    priors: tuple[Prior, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from lifelong_slam.result import GraphSnapshot
 
 Array = NDArray[np.float64]
 
-_SCAN, _PATH, _ODOMETRY, _LOOP = [90, 170, 255], [60, 200, 120], [150, 150, 150], [235, 95, 20]
+_SCAN, _PATH = [90, 170, 255], [60, 200, 120]
+_EDGES = {"odometry": [150, 150, 150], "loop": [235, 95, 20], "composed": [160, 80, 200]}
 _PIECE = 200  # poses in one piece of the path
 
 
@@ -106,11 +107,11 @@ class RerunViewer:
             self._piece += 1
 
     def _log_graph(self, graph: GraphSnapshot) -> None:
-        """Record keyframes as points and edges as lines, loop closures in their own colour."""
+        """Record keyframes as points and edges as lines, each kind in its own colour."""
         rr = self._rr
         positions = [pose[:3, 3] for pose in graph.poses.values()]
         self._recording.log("map/graph/keyframes", rr.Points3D(positions, radii=0.15, colors=_PATH))
-        for kind, colour in (("odometry", _ODOMETRY), ("loop", _LOOP)):
+        for kind, colour in _EDGES.items():
             lines = [
                 [graph.poses[edge.source][:3, 3], graph.poses[edge.target][:3, 3]]
                 for edge in graph.edges

@@ -145,6 +145,7 @@ def describe(saved: SavedMap) -> dict[str, Any]:
         "edges": {
             "odometry": sum(edge.kind == "odometry" for edge in used),
             "loop": sum(edge.kind == "loop" for edge in used),
+            "composed": sum(edge.kind == "composed" for edge in used),
             "rejected": len(saved.rejected),
         },
         "scans": sum(session["scans"] for session in sessions),
@@ -218,7 +219,8 @@ def rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         ("Pose graph", f"{facts['vertices']} vertices, {facts['removed_keyframes']} removed"),
         (
             "Edges",
-            f"{edges['odometry']} odometry, {edges['loop']} loop, {edges['rejected']} rejected",
+            f"{edges['odometry']} odometry, {edges['loop']} loop, {edges['composed']} composed,"
+            f" {edges['rejected']} rejected",
         ),
         ("Scans", f"{facts['scans']:,} on {facts['path_length_m']:.1f} m"),
         ("Map", f"{facts['map_points']:,} points, one in {facts['voxel_size_m']:g} m"),

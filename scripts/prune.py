@@ -6,14 +6,16 @@
 SE(2) and SE(3) graphs are read; a file without vertices is chained from its edges. The graph is optimised,
 pruned, and optimised again. Settings, with their defaults in conf/prune.yaml:
 
-    graph=FILE           g2o file; edges between a vertex and the next are odometry, unless a comment line
-                         `# loop` or `# odometry` before them says otherwise
+    graph=FILE           g2o file; edges between a vertex and the next, whichever way round, are odometry,
+                         unless a comment says otherwise: a line `# odometry`, `# loop` or `# composed`
+                         before them (docs/pruning.md has the rule, and what else a file may hold)
     out=FILE             g2o file to write what is left to, of the same dimension
     pruning=geometry     none, geometry, decimate, random, chow_liu or dense, of conf/pruning;
                          pruning.KEY=VALUE changes a setting of it
     keep=0.3333          share of the vertices that stay
     truth=FILE           true poses, for the error (APE: RMSE after alignment, in the plane if the graph
-                         is): g2o, edges between true poses (EDGE2, EDGE3), or TUM, a row for each vertex
+                         is): g2o, edges between true poses (EDGE2, EDGE3), or TUM, a row for each vertex;
+                         vertices that it lacks or that no edge reaches aren't judged
     robust=true          let loop closures vote, and leave out those that don't fit; false trusts them all
     json=FILE            write the figures
     seed=0               of pruning=random
@@ -23,6 +25,7 @@ pruned, and optimised again. Settings, with their defaults in conf/prune.yaml:
 Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
 """
 
+import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +46,9 @@ from lifelong_slam.io.g2o import read_g2o, write_g2o
 from lifelong_slam.io.graph_truth import read_truth
 from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything
+from lifelong_slam.result import GraphSnapshot
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,8 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
     seed_everything(settings.seed)
     pruning = build(config.pruning)
     graph = read_g2o(Path(settings.graph))
-    truth = read_truth(Path(settings.truth), graph.poses) if settings.truth else None
+    judged = sorted(set(graph.poses) - isolated(graph))
+    truth = read_truth(Path(settings.truth), judged) if settings.truth else None
     result = reduce(graph, pruning, settings.keep, graph.planar, settings.robust)
     if settings.out:
         if not result.complete:
@@ -100,34 +107,63 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
     facts = {
         "run": describe_run(arguments, settings.seed),
         "planar": graph.planar,
-        **figures(result, truth, graph.planar),
+        **figures(result, judged, truth, graph.planar),
     }
     if settings.json:
         write_json(Path(settings.json), facts)
     return facts
 
 
-def figures(result: Reduction, truth: dict[int, Array] | None, planar: bool) -> dict[str, Any]:
-    """Return what the states of a reduction are like, and how far the last is from the optimum."""
-    stay, every = result.pruned.vertices, result.read.vertices
+def isolated(graph: GraphSnapshot) -> set[int]:
+    """Return the vertices of which nothing is measured, after a warning if there are any."""
+    alone = set(graph.poses) - {end for edge in graph.edges for end in (edge.source, edge.target)}
+    alone -= {*graph.fixed, *(prior.vertex for prior in graph.priors)}
+    if alone:
+        logger.warning(
+            "no edges lead to %d of %d vertices, such as %d: they stay where they are and aren't judged",
+            len(alone),
+            len(graph.poses),
+            min(alone),
+        )
+    return alone
+
+
+def figures(
+    result: Reduction, judged: list[int], truth: dict[int, Array] | None, planar: bool
+) -> dict[str, Any]:
+    """Return what the states of a reduction are like, and how far the last is from the optimum.
+
+    Args:
+        result: the reduction.
+        judged: the vertices that figures are about, without regard to the truth.
+        truth: true poses (4, 4) of vertices, those that are judged by it.
+        planar: the graph is.
+    """
+    among = set(judged)
+    stay = [vertex for vertex in result.pruned.vertices if vertex in among]
+
+    def ape(poses: dict[int, Array], vertices: list[int]) -> float | None:
+        known = [vertex for vertex in vertices if truth and vertex in truth]
+        return rmse(vertex_distances(poses, truth, known, planar)) if truth and known else None
 
     def of_state(state: State) -> dict[str, Any]:
         return {
             "vertices": len(state.vertices),
             "edges": state.edges,
             "loops": state.loops,
+            "composed": state.composed,
             "rejected": state.rejected,
             "chi_square": state.chi_square,
             "seconds": state.seconds,
-            "ape_staying_m": truth and rmse(vertex_distances(state.poses, truth, stay, planar)),
-            "ape_all_m": truth and rmse(vertex_distances(state.poses, truth, every, planar)),
+            "ape_staying_m": ape(state.poses, stay),
+            "ape_all_m": ape(state.poses, judged),
         }
 
     optimum, pruned = result.optimum.poses, result.pruned.poses
     return {
         "states": {name: of_state(getattr(result, name)) for name in ("read", "optimum", "pruned")},
         "moved_staying_m": float(vertex_distances(pruned, optimum, stay, planar).mean()),
-        "moved_all_m": float(vertex_distances(pruned, optimum, every, planar).mean()),
+        "moved_all_m": float(vertex_distances(pruned, optimum, judged, planar).mean()),
     }
 
 
@@ -155,6 +191,7 @@ _ROWS = (
     ("Vertices", "vertices", "d"),
     ("Edges", "edges", "d"),
     ("Loop closures", "loops", "d"),
+    ("Composed edges", "composed", "d"),
     ("Rejected", "rejected", "d"),
     ("Chi-square", "chi_square", ".2f"),
     ("APE, vertices that stay [m]", "ape_staying_m", ".4f"),

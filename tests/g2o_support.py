@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from lifelong_slam.geometry import exp, invert
-from lifelong_slam.io.g2o import planar_poses
+from lifelong_slam.io.g2o_format import planar_poses
 from lifelong_slam.result import Edge, GraphSnapshot
 
 PER_LAP = 20

@@ -45,11 +45,12 @@ class Metric:
 
 
 def some_graph(positions):
-    """A chain over the positions with a closure from the last to the first."""
+    """A chain over the positions, a closure from the last to the first, a composed edge half-way."""
     count = len(positions)
     chain = [(i, i + 1) for i in range(count - 1)]
-    is_loop = np.array([False] * (count - 1) + [True])
-    return GraphSketch(positions, np.array([*chain, (count - 1, 0)]), is_loop)
+    edges = np.array([*chain, (count - 1, 0), (0, count // 2)])
+    is_loop, is_composed = np.arange(count + 1) == count - 1, np.arange(count + 1) == count
+    return GraphSketch(positions, edges, is_loop, is_composed)
 
 
 def some_evidence(reference=True, points=3000, **changes):

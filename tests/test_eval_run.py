@@ -79,6 +79,7 @@ def test_metrics_have_every_section(judged):
     assert not {"position_error", "path_length"} & metrics["trajectory"]["reasons"].keys()
     assert metrics["map"]["points"] == 5000
     counts = {"vertices": 3, "edges": 3, "odometry_edges": 2, "loop_edges": 1}
+    counts["composed_edges"] = 0
     size = {"title": "Pose graph", "value": 3.0, "unit": "vertices", "less_is_better": None}
     headlines = {"graph_size": size}
     assert metrics["graph"] == {**counts, "reasons": {}, "warnings": [], "headlines": headlines}
@@ -196,6 +197,20 @@ def test_kinds_of_edges_are_inferred_where_the_file_does_not_say(tmp_path):
     lines = [line for line in GRAPH.splitlines() if not line.startswith("#")]
     (tmp_path / "a.g2o").write_text("\n".join(lines))
     assert read_graph(tmp_path / "a.g2o").is_loop.tolist() == [False, False, True]
+
+
+def test_a_planar_graph_with_kinds_fixed_vertices_and_priors_is_read(tmp_path):
+    unit = "1 0 0 1 0 1"
+    (tmp_path / "a.g2o").write_text(
+        "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 3 1 2 0\nVERTEX_SE2 8 4 5 0\nFIX 0\n"
+        f"EDGE_SE2 3 0 1 0 0 {unit}\nEDGE_SE2 3 8 1 0 0 {unit} # composed\n"
+        f"EDGE_SE2 0 8 1 0 0 {unit} # loop\nEDGE_PRIOR_SE2 8 4 5 0 {unit}\n"
+    )
+    graph = read_graph(tmp_path / "a.g2o")
+    np.testing.assert_array_equal(graph.positions, [[0, 0, 0], [1, 2, 0], [4, 5, 0]])
+    assert graph.edges.tolist() == [[1, 0], [1, 2], [0, 2]]
+    assert graph.is_loop.tolist() == [False, False, True]
+    assert graph.is_composed.tolist() == [False, True, False]
 
 
 def test_edges_between_unknown_vertices_are_refused(tmp_path):

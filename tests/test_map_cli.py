@@ -127,7 +127,7 @@ def test_info_tells_what_is_in_the_map(cli, saved):
     assert (first["vertices"], second["vertices"], facts["vertices"]) == (6, 3, 9)
     assert first["path_length_m"] == pytest.approx(5 * STEP + STEP * 3 / 4)
     assert first["duration_s"] == pytest.approx(2.3)
-    assert facts["edges"] == {"odometry": 7, "loop": 0, "rejected": 0}
+    assert facts["edges"] == {"odometry": 7, "loop": 0, "composed": 0, "rejected": 0}
     assert facts["size_bytes"] == saved.stat().st_size
     low, high = np.array(facts["extent_m"])
     np.testing.assert_allclose(low[1:], [-WIDTH / 2, 0.0], atol=0.1)
@@ -138,7 +138,7 @@ def test_info_is_a_table_for_people(cli, saved):
     status, out, _ = cli("info", saved)
     assert status == 0
     lines = {line.split("  ")[0]: line for line in out.splitlines()}
-    assert "7 odometry, 0 loop, 0 rejected" in lines["Edges"]
+    assert "7 odometry, 0 loop, 0 composed, 0 rejected" in lines["Edges"]
     assert "9 vertices" in lines["Pose graph"]
     assert "not finished, not located" in out
 

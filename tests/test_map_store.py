@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -95,6 +96,35 @@ def test_sessions_are_numbered_and_only_the_first_is_located_by_itself(path):
         store.end_session(1)
     assert load(path).sessions[1].located
     assert load(path).sessions[1].finished
+    assert check_map(path) == []
+
+
+def test_a_map_of_the_first_format_is_read_as_it_is_and_gone_on_from(path):
+    """It differs in that edges are odometry or loop closures."""
+    new_map(path)
+    before = load(path)
+    with closing(sqlite3.connect(path)) as db:
+        (table,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'edges'").fetchone()
+        old_table = table.replace(", 'composed'", "")
+        db.executescript(
+            "PRAGMA foreign_keys = OFF; CREATE TABLE kept AS SELECT * FROM edges; DROP TABLE edges;"
+            f"{old_table};"
+            "INSERT INTO edges SELECT * FROM kept; DROP TABLE kept;"
+            "CREATE INDEX edges_of_source ON edges (source);"
+            "CREATE INDEX edges_of_target ON edges (target);"
+            "PRAGMA user_version = 1"
+        )
+        with pytest.raises(sqlite3.IntegrityError):
+            db.execute("UPDATE edges SET kind = 'composed'")
+    old = contents(path.parent)
+    assert_same(load(path), before)
+    assert contents(path.parent) == old
+    with MapStore.open(path) as store:
+        assert_same(store.load(), before)
+        store.write(MapUpdate(edges={7: edge(0, 4, "composed"), 8: edge(1, 4, "loop")}))
+    edges = load(path).edges
+    assert [edges[i].kind for i in (7, 8)] == ["composed", "loop"]
+    assert_same({i: edges[i] for i in before.edges}, before.edges)
     assert check_map(path) == []
 
 

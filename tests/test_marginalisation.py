@@ -95,7 +95,8 @@ def test_a_chain_has_the_error_of_both_motions():
     expected = chained.covariance * 1e-4
     np.testing.assert_allclose(spread, expected, atol=0.05 * np.abs(expected).max())
     assert (chained.source, chained.target, chained.kind) == (0, 2, "odometry")
-    assert chain(first, random_edge(rng, 1, 2, "loop")).kind == "loop"
+    assert chain(first, random_edge(rng, 1, 2, "loop")).kind == "composed"
+    assert chain(random_edge(rng, 0, 1, "composed"), second).kind == "composed"
 
 
 def test_fused_measurements_are_the_optimum_that_gtsam_finds():
@@ -223,19 +224,30 @@ def test_odometry_and_loop_closures_stay_apart():
     kind = {frozenset((e.source, e.target)): e.kind for e in graph.edges}
     assert kind == {
         frozenset((0, 2)): "odometry",
-        frozenset((0, 3)): "loop",
-        frozenset((2, 3)): "loop",
+        frozenset((0, 3)): "composed",
+        frozenset((2, 3)): "composed",
     }
 
 
-def test_parallel_edges_are_fused_with_their_kind_only():
+def test_what_is_fused_is_composed_unless_it_is_of_one_kind():
+    rng = np.random.default_rng(12)
+    for kinds, expected in (
+        (("odometry", "odometry"), "odometry"),
+        (("loop", "loop"), "loop"),
+        (("loop", "composed"), "composed"),
+        (("odometry", "loop"), "composed"),
+    ):
+        assert fuse([random_edge(rng, 0, 1, kind) for kind in kinds]).kind == expected
+
+
+def test_what_can_be_outvoted_is_not_fused_with_odometry():
     rng = np.random.default_rng(10)
     graph, truth = star_of(rng, 3, ["odometry", "loop", "loop"])
     T = invert(truth[2]) @ truth[3]
     for kind in ("loop", "odometry"):
         graph.add_edge(Edge(2, 3, T, random_covariance(rng), kind))
     StarMesh().remove(graph, 1, ())
-    assert sorted(e.kind for e in graph.between(2, 3)) == ["loop", "odometry"]
+    assert sorted(e.kind for e in graph.between(2, 3)) == ["composed", "odometry"]
 
 
 def loop_of(rng, count=24, wrong=None):

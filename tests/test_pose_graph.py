@@ -3,11 +3,12 @@
 import gtsam
 import numpy as np
 import pytest
-from graph_support import closure, disagreement, edge, full_covariance, graph_of, laps
+from graph_support import COVARIANCE, closure, disagreement, edge, full_covariance, graph_of, laps
 from slam_support import planar
 
 from lifelong_slam.geometry import invert
 from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.result import Prior
 
 
 def test_two_measurements_of_one_motion_average_by_their_information():
@@ -154,3 +155,41 @@ def test_two_graphs_of_the_same_edges_are_equal_to_the_last_bit():
         graph.optimise(reconsider=True)
         poses.append(np.array(list(graph.poses().values())))
     np.testing.assert_array_equal(poses[0], poses[1])
+
+
+def test_fixed_vertices_and_priors_take_the_place_of_a_root():
+    """The third part has neither, and hangs on its lowest vertex."""
+    poses = {i: planar(float(i), 0, 0) for i in range(9)}
+    links = (0, 1, 3, 4, 6, 7)
+    edges = {i: edge(i, i + 1, planar(1.5, 0, 0)) for i in links}
+    prior = Prior(4, planar(10.0, 0, 0), COVARIANCE)
+    graph = PoseGraph()
+    graph.restore(poses, edges, solved=False, fixed=[1], priors=[prior])
+    assert graph.held == {1, 4, 6}
+    assert graph.edge_count == 6
+    graph.optimise()
+    found = [graph.pose(i)[0, 3] for i in range(9)]
+    np.testing.assert_allclose(found, [-0.5, 1, 2.5, 8.5, 10, 11.5, 6, 7.5, 9], atol=1e-6)
+    assert graph.chi_square() == pytest.approx(0, abs=1e-9)
+    assert (graph.snapshot().fixed, graph.snapshot().priors) == ((1,), (prior,))
+    for vertex in (1, 4):
+        with pytest.raises(ValueError, match="holds its component"):
+            graph.remove_vertex(vertex)
+    graph.remove_vertex(5)
+    assert 5 not in graph
+
+
+def test_priors_count_against_a_closure():
+    """Two sure priors 10 m apart, and a closure that says 14 m: without them it would bend odometry."""
+    loose = 25 * np.eye(6)
+    edges = {
+        0: edge(0, 1, planar(10, 0, 0), covariance=loose),
+        1: edge(0, 1, planar(14, 0, 0), "loop"),
+    }
+    poses = {0: np.eye(4), 1: planar(10, 0, 0)}
+    priors = [Prior(i, T, COVARIANCE) for i, T in poses.items()]
+    for known, rejected in (([], 0), (priors, 1)):
+        graph = PoseGraph()
+        graph.restore(poses, edges, solved=False, priors=known)
+        graph.optimise()
+        assert len(graph.rejected) == rejected

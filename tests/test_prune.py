@@ -13,14 +13,16 @@ import prune
 from eval.vertices import rmse, vertex_distances
 from lifelong_slam.errors import ConfigError, SourceError
 from lifelong_slam.geometry import exp, invert, log, to_quaternion
+from lifelong_slam.graph.edges import reverse
 from lifelong_slam.graph.initialisation import best_start, chordal
 from lifelong_slam.graph.marginalisation import Dense, StarMesh
 from lifelong_slam.graph.pruning import NoPruning, Pruner
 from lifelong_slam.graph.reduction import LoadedGraph, reduce
 from lifelong_slam.graph.selection import Geometry
 from lifelong_slam.io.g2o import read_g2o, write_g2o
+from lifelong_slam.io.g2o_format import planar_poses
 from lifelong_slam.io.graph_truth import read_truth
-from lifelong_slam.result import Edge, GraphSnapshot
+from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / os.environ.get("LIFELONG_SLAM_DATA", "../shared/data") / "pose_graphs"
@@ -279,7 +281,7 @@ def test_truth_is_read_from_every_kind_of_file(tmp_path):
         ("", "empty"),
         ("EDGE2 0 1 1 0\n", "line 1: not a valid EDGE2"),
         ("EDGE2 0 1 1 0 0\nEDGE2 5 6 1 0 0\n", "such as 5"),
-        ("VERTEX_SE2 0 1 2 3\n", "lacks 1 vertices, such as 1"),
+        ("VERTEX_SE2 2 1 2 3\n", "lacks 2 of 2 vertices, such as 0"),
         ("0.0 1 2 3 0 0 0 1\n", "1 rows for 2 vertices"),
     ],
 )
@@ -287,6 +289,270 @@ def test_truth_that_does_not_fit_is_refused(tmp_path, content, message):
     (tmp_path / "truth.txt").write_text(content)
     with pytest.raises(SourceError, match=rf"truth\.txt.*{message}"):
         read_truth(tmp_path / "truth.txt", [0, 1])
+
+
+@pytest.mark.parametrize("ratio", [1e9, 1e11])
+def test_edges_that_hardly_know_the_attitude_have_a_start(ratio):
+    graph, _ = laps(planar=True)
+    loose = np.diag([1e-6 * ratio] * 3 + [1e-6] * 3)
+    edges = [Edge(e.source, e.target, e.T_source_target, loose, e.kind) for e in graph.edges]
+    poses = chordal(GraphSnapshot(graph.poses, edges))
+    assert np.isfinite(list(poses.values())).all()
+    result = reduce(GraphSnapshot(graph.poses, edges), NoPruning(), keep=1.0)
+    assert result.optimum.chi_square < result.read.chi_square
+
+
+def held_optimum(graph, start):
+    """GTSAM's own optimum, fixed vertices being equality constraints: (4, 4) poses by vertex."""
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for i, pose in start.items():
+        values.insert(i, gtsam.Pose3(pose))
+    for e in graph.edges:
+        noise = gtsam.noiseModel.Gaussian.Covariance(e.covariance)
+        T = gtsam.Pose3(e.T_source_target)
+        factors.push_back(gtsam.BetweenFactorPose3(e.source, e.target, T, noise))
+    for prior in graph.priors:
+        noise = gtsam.noiseModel.Gaussian.Covariance(prior.covariance)
+        T = gtsam.Pose3(prior.T_map_vertex)
+        factors.push_back(gtsam.PriorFactorPose3(prior.vertex, T, noise))
+    for i in graph.fixed:
+        factors.push_back(gtsam.NonlinearEqualityPose3(i, gtsam.Pose3(graph.poses[i])))
+    found = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    return {i: found.atPose3(i).matrix() for i in start}
+
+
+def odometry_alone(graph):
+    return [edge for edge in graph.edges if edge.kind == "odometry"]
+
+
+def pose_errors(poses, expected):
+    return [np.abs(log(invert(expected[i]) @ poses[i])).max() for i in expected]
+
+
+@pytest.mark.parametrize("start", ["as driven", "nowhere"])
+def test_fixed_vertices_hold_their_part_where_the_file_has_them(start):
+    graph, truth = laps()
+    shift = exp(np.array([0.1, 0.2, 2.0, 50.0, -20.0, 3.0]))
+    truth = {i: shift @ pose for i, pose in truth.items()}
+    fixed = (7, 30, 59)
+    guess = graph.poses if start == "as driven" else dict.fromkeys(graph.poses, np.eye(4))
+    poses = guess | {i: truth[i] for i in fixed}
+    snapshot = GraphSnapshot(poses, odometry_alone(graph), fixed)
+    result = reduce(snapshot, GEOMETRY, keep=0.3)
+    expected = held_optimum(snapshot, truth)
+    assert max(pose_errors(result.optimum.poses, expected)) < 1e-4
+    for state in (result.optimum, result.pruned):
+        assert max(pose_errors(state.poses, {i: truth[i] for i in fixed})) < 1e-6
+    assert set(fixed) <= set(result.pruned.vertices)
+    assert len(result.pruned.vertices) == 18
+    assert result.graph.fixed == fixed
+
+
+@pytest.mark.parametrize("start", ["as driven", "nowhere"])
+def test_priors_pull_their_part_to_where_they_measured_it(start):
+    """The map frame of the priors is far from that of the file's poses, as with UTM coordinates."""
+    graph, truth = laps(planar=True)
+    shift = exp(np.array([0.0, 0.0, 2.5, 0.0, 0.0, 0.0]))
+    shift[:3, 3] = [4.5e5, 5.4e6, 120.0]
+    rng = np.random.default_rng(3)
+    covariance = np.diag([0.1] * 3 + [0.2] * 3) ** 2
+    priors = tuple(
+        Prior(i, shift @ truth[i] @ exp(0.05 * rng.normal(size=6)), covariance)
+        for i in range(0, 60, 7)
+    )
+    guess = graph.poses if start == "as driven" else dict.fromkeys(graph.poses, np.eye(4))
+    snapshot = GraphSnapshot(guess, graph.edges, priors=priors)
+    result = reduce(snapshot, GEOMETRY, keep=0.3)
+    expected = held_optimum(snapshot, {i: shift @ pose for i, pose in truth.items()})
+    assert max(pose_errors(result.optimum.poses, expected)) < 1e-3
+    assert max(pose_errors(result.pruned.poses, expected)) < 0.05
+    assert {prior.vertex for prior in priors} <= set(result.pruned.vertices)
+    assert result.graph.priors == priors
+    assert result.complete
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.5, 3.1])
+@pytest.mark.parametrize("planar", [True, False])
+def test_priors_of_positions_put_a_graph_where_they_measured_it(tmp_path, planar, turn):
+    """Their map is turned and far away: the attitude at the start says nothing."""
+    path, _ = write_laps(tmp_path, planar=planar)
+    _, truth = laps(planar=planar)
+    shift = exp(np.array([0.0, 0.0, turn, 0.0, 0.0, 0.0]))
+    shift[:3, 3] = [4.5e5, 5.4e6, 0.0 if planar else 120.0]
+    rng = np.random.default_rng(1)
+    with path.open("a") as file:
+        for i in range(0, 60, 7):
+            x, y, z = (shift @ truth[i])[:3, 3] + 0.1 * rng.normal(size=3)
+            file.write(
+                f"EDGE_PRIOR_SE2_XY {i} {x} {y} 100 0 100\n"
+                if planar
+                else f"EDGE_SE3_PRIORXYZ {i} {x} {y} {z} 100 0 0 100 0 100\n"
+            )
+    result = reduce(read_g2o(path), NoPruning(), keep=1.0).optimum
+    assert result.rejected == 0
+    errors = [np.linalg.norm((result.poses[i] - shift @ truth[i])[:3, 3]) for i in truth]
+    assert rmse(np.array(errors)) < 0.1
+
+
+def test_a_part_without_priors_stays_where_it_is():
+    graph, _ = laps(count=1)
+    far = exp(np.array([0.0, 0.0, 0.0, 100.0, 0.0, 0.0]))
+    others = {i + 100: far @ pose for i, pose in graph.poses.items()}
+    more = [
+        Edge(e.source + 100, e.target + 100, e.T_source_target, e.covariance, e.kind)
+        for e in graph.edges
+    ]
+    prior = Prior(10, graph.poses[10] @ far, 1e-4 * np.eye(6))
+    both = GraphSnapshot(graph.poses | others, graph.edges + more, priors=(prior,))
+    poses = reduce(both, NoPruning(), keep=1.0).optimum.poses
+    assert max(pose_errors(poses, others)) < 1e-6
+    assert max(pose_errors(poses, {10: prior.T_map_vertex})) < 1e-6
+
+
+def test_fixed_vertices_and_priors_are_written_back(cli, tmp_path, caplog):
+    caplog.set_level("INFO")
+    graph, truth = laps(planar=True)
+    priors = (Prior(33, truth[33], graph.edges[0].covariance),)
+    given = GraphSnapshot(graph.poses | {12: truth[12]}, graph.edges, (12,), priors)
+    write_g2o(tmp_path / "in.g2o", given, planar=True)
+    ends = [f"graph={tmp_path / 'in.g2o'}", f"out={tmp_path / 'out.g2o'}"]
+    assert cli(*ends, "keep=0.3")[0] == 0
+    assert "60 vertices (1 fixed), 99 edges, 1 priors" in caplog.text
+    back = read_g2o(tmp_path / "out.g2o")
+    assert back.fixed == (12,)
+    np.testing.assert_allclose(back.poses[12], truth[12], atol=1e-6)
+    assert [prior.vertex for prior in back.priors] == [33]
+
+
+def unnamed(path):
+    """Take the comments that name kinds out of a file."""
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line.partition("#")[0] for line in lines) + "\n")
+
+
+@pytest.mark.parametrize("closures", ["true and wrong", "wrong"])
+def test_graphs_written_from_new_to_old_are_reduced_as_others_are(cli, tmp_path, caplog, closures):
+    """The name of each edge's kind is gone as well: all that tells them apart is where they lead."""
+    graph, truth = laps(seed=1, planar=True, wrong=10)
+    loops = [edge for edge in graph.edges if edge.kind == "loop"]
+    odometry = [reverse(edge) for edge in reversed(odometry_alone(graph))]
+    chosen = loops if closures == "true and wrong" else loops[-10:]
+    path = tmp_path / "in.g2o"
+    write_g2o(path, GraphSnapshot(graph.poses, [*odometry, *chosen]), planar=True)
+    write_g2o(tmp_path / "truth.g2o", GraphSnapshot(truth, []), planar=True)
+    unnamed(path)
+    out, figures = tmp_path / "out.g2o", tmp_path / "figures.json"
+    ends = [f"graph={path}", f"truth={tmp_path / 'truth.g2o'}", f"out={out}", f"json={figures}"]
+    assert cli(*ends)[0] == 0
+    read, optimum, pruned = json.loads(figures.read_text())["states"].values()
+    assert (read["loops"], read["edges"]) == (len(chosen), 59 + len(chosen))
+    assert optimum["rejected"] == 10
+    assert pruned["ape_all_m"] == pytest.approx(optimum["ape_all_m"], abs=0.05)
+    lost = "10 of 10 loop closures are outvoted, and only odometry is left"
+    assert (lost in caplog.text) == (closures == "wrong")
+
+
+def test_pruning_makes_composed_edges_and_no_closures(cli, tmp_path):
+    path, _ = write_laps(tmp_path)
+    out, figures = tmp_path / "out.g2o", tmp_path / "figures.json"
+    _, shown, _ = cli(f"graph={path}", f"out={out}", f"json={figures}", "keep=0.3")
+    read, optimum, pruned = json.loads(figures.read_text())["states"].values()
+    assert (read["loops"], optimum["loops"], optimum["composed"]) == (40, 40, 0)
+    assert pruned["loops"] < 40
+    assert pruned["composed"] > 10
+    (row,) = (line for line in shown.splitlines() if line.startswith("Composed edges"))
+    assert row.split()[2:] == ["0", "0", str(pruned["composed"])]
+    kinds = [edge.kind for edge in read_g2o(out).edges]
+    assert kinds.count("composed") == pruned["composed"]
+    assert kinds.count("loop") == pruned["loops"]
+
+
+def test_each_part_that_outvoted_closures_led_to_keeps_a_vertex():
+    """Else its last vertex would be removed, which no edge says anything about."""
+    step = exp(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
+    ids = [*range(8), *range(20, 28)]
+    edges = [Edge(i, i + 1, step, np.eye(6), "odometry") for i in ids if i not in (7, 27)]
+    edges.append(Edge(7, 20, step, np.eye(6), "loop"))
+    graph = LoadedGraph(GraphSnapshot(dict.fromkeys(ids, np.eye(4)), edges))
+    graph._rejected = set(graph._loops)
+    graph._solve(set())
+    GEOMETRY.reduce(graph, 1)
+    assert graph.vertices == [0, 20]
+
+
+def test_what_no_edge_reaches_stays_and_is_not_judged(cli, tmp_path, caplog):
+    graph, _ = laps(planar=True)
+    plain, figures, out = (tmp_path / name for name in ("plain.json", "f.json", "out.g2o"))
+    path, true = write_laps(tmp_path, planar=True)
+    cli(f"graph={path}", f"truth={true}", f"json={plain}", "pruning=none")
+    lone = planar_poses(np.array([[500.0, 5.0, 1.0]]))[0]
+    write_g2o(path, GraphSnapshot(graph.poses | {1000: lone}, graph.edges), planar=True)
+    ends = [f"graph={path}", f"truth={true}", f"json={figures}", f"out={out}"]
+    assert cli(*ends, "keep=0.4")[0] == 0
+    assert "no edges lead to 1 of 61 vertices, such as 1000" in caplog.text
+    (_, alone, _), (_, optimum, pruned) = (
+        json.loads(file.read_text())["states"].values() for file in (plain, figures)
+    )
+    assert optimum["ape_all_m"] == pytest.approx(alone["ape_all_m"], rel=1e-9)
+    assert pruned["vertices"] == 24
+    np.testing.assert_allclose(read_g2o(out).poses[1000], lone, atol=1e-12)
+
+
+def test_vertices_that_the_truth_lacks_are_not_judged(cli, tmp_path, caplog):
+    _, truth = laps(planar=True)
+    path, true = write_laps(tmp_path, planar=True)
+    known = {i: pose for i, pose in truth.items() if i >= 15}
+    write_g2o(true, GraphSnapshot(known, []), planar=True)
+    figures = tmp_path / "f.json"
+    ends = [f"graph={path}", f"truth={true}", f"json={figures}"]
+    assert cli(*ends, "pruning=none")[0] == 0
+    assert "lacks 15 of 60 vertices, such as 0: the other 45 are judged" in caplog.text
+    _, optimum, _ = json.loads(figures.read_text())["states"].values()
+    _, poses = gtsam_optimum(path, spatial=False)
+    expected = rmse(vertex_distances(poses, known, known, planar=True))
+    assert optimum["ape_all_m"] == pytest.approx(expected, abs=1e-4)
+
+
+def test_two_robots_with_symbols_for_ids_are_told_apart(cli, tmp_path):
+    graph, _ = laps(count=2)
+    robots = [ord(letter) << 56 for letter in "ab"]
+    poses = {first + i: pose for first in robots for i, pose in graph.poses.items()}
+    edges = [
+        Edge(first + e.source, first + e.target, e.T_source_target, e.covariance, e.kind)
+        for first in robots
+        for e in graph.edges
+    ]
+    meeting = Edge(robots[0] + 39, robots[1], invert(graph.poses[39]), edges[0].covariance, "loop")
+    path, out, figures = (tmp_path / name for name in ("in.g2o", "out.g2o", "f.json"))
+    write_g2o(path, GraphSnapshot(poses, [meeting, *edges]))
+    unnamed(path)
+    assert cli(f"graph={path}", f"out={out}", f"json={figures}", "keep=0.5")[0] == 0
+    read, _, pruned = json.loads(figures.read_text())["states"].values()
+    assert (read["edges"], read["loops"]) == (2 * 59 + 1, 2 * 20 + 1)
+    assert pruned["vertices"] == len(read_g2o(out).poses) == 40
+
+
+def test_a_graph_whose_edges_do_not_know_everything_is_reduced(cli, tmp_path, caplog):
+    """A third of the edges, odometry among them, say nothing of z, or claim less than nothing."""
+    path, true = write_laps(tmp_path)
+    lines = path.read_text().splitlines()
+    edges = [i for i, line in enumerate(lines) if line.startswith("EDGE")]
+    for k, i in enumerate(edges[::3]):
+        fields = lines[i].split()
+        fields[10 + 11] = "0.0" if k % 2 else "-3.0"  # the information of z
+        lines[i] = " ".join(fields)
+    path.write_text("\n".join(lines) + "\n")
+    out, figures = tmp_path / "out.g2o", tmp_path / "f.json"
+    ends = [f"graph={path}", f"truth={true}", f"out={out}", f"json={figures}"]
+    assert cli(*ends, "keep=0.4")[0] == 0
+    assert caplog.text.count("isn't positive definite") == 1
+    assert "33 of 99 edges" in caplog.text
+    _, optimum, pruned = json.loads(figures.read_text())["states"].values()
+    assert optimum["rejected"] == 0
+    assert optimum["ape_all_m"] < 0.3
+    assert pruned["ape_all_m"] < 1.3 * optimum["ape_all_m"]
+    back = read_g2o(out)
+    assert np.isfinite([edge.covariance for edge in back.edges]).all()
 
 
 @needs_data

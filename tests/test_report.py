@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from report_support import array, some_evidence, some_verdicts, unpacked
 
+from eval import plots
 from eval.evaluation import Verdict
 from eval.metrics.metric import Curve, Plot
 from eval.report import charts, views
@@ -155,11 +156,18 @@ def test_without_reference_a_run_report_shows_path_and_heights(tmp_path):
     assert "Error along the path" not in html
     assert "Position error, Map distance, F score, Time per scan: there is no reference" in html
     trajectories, _, heights = unpacked(html)
-    assert [trace.get("name") for trace in trajectories["data"][:2]] == [
-        "loop closures",
-        "estimate",
-    ]
+    composed, loops, estimate = trajectories["data"][:3]
+    named = [trace.get("name") for trace in (composed, loops, estimate)]
+    assert named == ["composed edges", "loop closures", "estimate"]
+    assert composed["line"]["color"] != loops["line"]["color"]
     assert np.nanmax(array(heights["data"][0]["z"])) > 1
+
+
+def test_on_paper_closures_and_composed_edges_are_named_and_told_apart():
+    evidence = some_evidence()
+    figure = plots.trajectory(evidence.estimate, evidence.comparison, evidence.graph)
+    drawn = {line.get_label(): line.get_color() for line in figure.axes[0].lines}
+    assert drawn["1 loop closure"] != drawn["1 composed edge"]
 
 
 @pytest.mark.parametrize("points", [0, 1])

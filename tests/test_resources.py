@@ -149,10 +149,12 @@ def test_what_was_not_sampled_has_a_reason(metric):
 
 
 def test_the_graph_is_counted_by_kind_and_plotted_as_it_grew():
-    graph = GraphSketch(np.zeros((4, 3)), np.zeros((5, 2), np.int64), np.arange(5) > 2)
+    edges = np.zeros((5, 2), np.int64)
+    graph = GraphSketch(np.zeros((4, 3)), edges, np.arange(5) == 3, np.arange(5) == 4)
     rows = {"stamp": np.arange(3.0), "vertices": np.array([1.0, 2, 4])}
     found = GraphSize().measure(Evidence(graph=graph, timeline=rows))
-    assert found.values == {"vertices": 4, "edges": 5, "odometry_edges": 3, "loop_edges": 2}
+    kinds = {"odometry_edges": 3, "loop_edges": 1, "composed_edges": 1}
+    assert found.values == {"vertices": 4, "edges": 5, **kinds}
     (curve,) = found.plots[0].curves
     assert curve.y.tolist() == [1, 2, 4]
     assert GraphSize().measure(Evidence(graph=graph)).plots == ()

@@ -21,8 +21,8 @@ def drive(viewer, scans=5, points=1000):
     for i in range(scans):
         pose = exp(np.array([0, 0, 0.1 * i, float(i), 0, 0]))
         edge = Edge(0, 1, np.eye(4), np.eye(6), "odometry")
-        loop = Edge(1, 0, np.eye(4), np.eye(6), "loop")
-        graph = GraphSnapshot({0: np.eye(4), 1: pose}, [edge, loop]) if i == 3 else None
+        loop, composed = (Edge(1, 0, np.eye(4), np.eye(6), k) for k in ("loop", "composed"))
+        graph = GraphSnapshot({0: np.eye(4), 1: pose}, [edge, loop, composed]) if i == 3 else None
         viewer.update(
             1_700_000_000_000_000_000 + i * 10**8, pose, rng.normal(size=(points, 3)), graph
         )
@@ -44,6 +44,7 @@ def test_recording_holds_poses_scans_path_and_graph(tmp_path):
         "/map/path/00000",
         "/map/graph/keyframes",
         "/map/graph/loop",
+        "/map/graph/composed",
     ):
         assert entity.encode() in data
 

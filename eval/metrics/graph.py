@@ -13,7 +13,7 @@ class GraphSize:
     name = "graph_size"
     title = "Pose graph"
     section = Section.GRAPH
-    keys: tuple[str, ...] = ("vertices", "edges", "odometry_edges", "loop_edges")
+    keys: tuple[str, ...] = ("vertices", "edges", "odometry_edges", "loop_edges", "composed_edges")
     needs: tuple[str, ...] = ("graph",)
     unit = "vertices"
     less_is_better: bool | None = None
@@ -26,13 +26,14 @@ class GraphSize:
         """Count."""
         graph = evidence.graph
         assert graph is not None
-        loops = int(graph.is_loop.sum())
+        loops, composed = int(graph.is_loop.sum()), int(graph.is_composed.sum())
         vertices, edges = len(graph.positions), len(graph.edges)
         values = {
             "vertices": vertices,
             "edges": edges,
-            "odometry_edges": edges - loops,
+            "odometry_edges": edges - loops - composed,
             "loop_edges": loops,
+            "composed_edges": composed,
         }
         return Measurement(values, float(vertices), plots=_growth(evidence.timeline))
 

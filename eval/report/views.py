@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 _ERROR_SCALE = [[step / 4, f"--error-{step}"] for step in range(5)]
 _HEIGHT_SCALE = [[step / 4, f"--height-{step}"] for step in range(5)]
 _DOTS = 2000  # that a browser moves smoothly
-_LOOPS = 1500
+_MOST_EDGES = 1500  # of a kind that are drawn
+_EDGE_COLOURS = {"loop closure": "--loop", "composed edge": "--composed"}
 _CELLS = 900  # along the longer side of a map
 # Pixels, with room for usual labels: with one scale for both axes, room made for a label changes the range
 # that is shown, whose labels may need other room, and so on.
@@ -33,7 +34,7 @@ def trajectories(
     comparison: TrajectoryComparison | None = None,
     graph: GraphSketch | None = None,
 ) -> Markup:
-    """Overlay estimate, reference and loop closures, seen from above.
+    """Overlay estimate, reference, loop closures and composed edges, seen from above.
 
     Args:
         estimate: in its own frame.
@@ -44,11 +45,11 @@ def trajectories(
     traces = [] if comparison is None else [_reference(comparison)]
     captions = [THINNED] if len(path) > POINTS else []
     loops = 0 if graph is None else int(graph.is_loop.sum())
-    if graph is not None and loops:
-        traces.append(_loops(_moved(graph.positions, comparison), graph.edges[graph.is_loop]))
+    for name, ends in [] if graph is None else _closing(graph, comparison):
+        traces.append(_edges(name, ends))
+        if len(ends) > _MOST_EDGES:
+            captions.append(f"{_MOST_EDGES:,} of {len(ends):,} {name}s are drawn.")
     traces.append(_estimate(path, estimate.timestamps, comparison))
-    if loops > _LOOPS:
-        captions.append(f"{_LOOPS:,} of {loops:,} loop closures are drawn.")
     traces.extend(_ends(path))
     over = "" if comparison is None else " over its reference"
     length = show(float(estimate.path_length))
@@ -219,18 +220,26 @@ def _estimate(
     }
 
 
-def _loops(vertices: Array, loops: NDArray[np.int64]) -> dict[str, Any]:
-    """Return loop closures as straight lines between their vertices."""
-    shown = loops[np.linspace(0, len(loops) - 1, min(len(loops), _LOOPS)).astype(int)]
-    ends = vertices[shown][:, :, :2]
+def _closing(
+    graph: GraphSketch, comparison: TrajectoryComparison | None
+) -> list[tuple[str, Array]]:
+    """Return the kinds of edges that close loops, as far as there are any, with (E, 2, 3) ends."""
+    vertices = _moved(graph.positions, comparison)
+    kinds = (("composed edge", graph.is_composed), ("loop closure", graph.is_loop))
+    return [(name, vertices[graph.edges[chosen]]) for name, chosen in kinds if chosen.any()]
+
+
+def _edges(name: str, ends: Array) -> dict[str, Any]:
+    """Return edges of one kind between (E, 2, 3) vertices as straight lines."""
+    shown = ends[np.linspace(0, len(ends) - 1, min(len(ends), _MOST_EDGES)).astype(int), :, :2]
     gaps = np.full((len(shown), 1, 2), np.nan)
     return {
-        **_line(np.concatenate([ends, gaps], axis=1).reshape(-1, 2), "loop closures"),
+        **_line(np.concatenate([shown, gaps], axis=1).reshape(-1, 2), f"{name}s"),
         "mode": "lines+markers",
-        "line": {"color": "--loop", "width": 1.2},
+        "line": {"color": _EDGE_COLOURS[name], "width": 1.2},
         "opacity": 0.7,
-        "marker": {"color": "--loop", "size": 4},
-        "hovertemplate": "loop closure<br>%{x:.1f}, %{y:.1f} m<extra></extra>",
+        "marker": {"color": _EDGE_COLOURS[name], "size": 4},
+        "hovertemplate": f"{name}<br>%{{x:.1f}}, %{{y:.1f}} m<extra></extra>",
     }
 
 

@@ -37,24 +37,28 @@ def outward(edge: Edge, vertex: int) -> Edge:
 
 
 def chain(first: Edge, second: Edge) -> Edge:
-    """Return the motion first a -> b, then b -> c; a loop closure in it makes it one."""
+    """Return the motion first a -> b, then b -> c: odometry if both are, else composed."""
     A = gtsam.Pose3(second.T_source_target).inverse().AdjointMap()
     return Edge(
         first.source,
         second.target,
         first.T_source_target @ second.T_source_target,
         _symmetric(A @ first.covariance @ A.T + second.covariance),
-        kind_of(first, second),
+        chained_kind(first, second),
     )
 
 
-def kind_of(*edges: Edge) -> EdgeKind:
-    """Return the kind of an edge that is made of others: a loop closure if any of them is one."""
-    return "odometry" if all(edge.kind == "odometry" for edge in edges) else "loop"
+def chained_kind(first: Edge, second: Edge) -> EdgeKind:
+    """Return the kind of an edge that leads through a vertex, which no closure by itself does."""
+    return "odometry" if first.kind == second.kind == "odometry" else "composed"
 
 
 def fuse(edges: list[Edge]) -> Edge:
-    """Return the mean, by information, of independent measurements of one pair of vertices."""
+    """Return the mean, by information, of independent measurements of one pair of vertices.
+
+    Of one kind it keeps that: closures of one pair are together still a closure of it. Otherwise it is
+    composed.
+    """
     return reduce(_fuse_two, edges)
 
 
@@ -66,7 +70,8 @@ def _fuse_two(first: Edge, second: Edge) -> Edge:
     shift = gtsam.Pose3.Logmap(motion.between(gtsam.Pose3(second.T_source_target)))
     mean = motion.compose(gtsam.Pose3.Expmap(gain @ shift)).matrix()
     covariance = _symmetric(gain @ second.covariance)
-    return Edge(first.source, first.target, mean, covariance, kind_of(first, second))
+    kind = first.kind if first.kind == second.kind else "composed"
+    return Edge(first.source, first.target, mean, covariance, kind)
 
 
 def _symmetric(C: Array) -> Array:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from lifelong_slam.geometry import adjoint, invert
-from lifelong_slam.graph.edges import chain, fuse, kind_of, outward, reverse
+from lifelong_slam.graph.edges import chain, chained_kind, fuse, outward, reverse
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.result import Edge
 
@@ -60,12 +60,12 @@ class StarMesh:
     Each weaker arm is chained to a strong one, whose uncertainty hardly counts beside its own. An edge
     between two that have one already is fused with it.
 
-    An edge that any loop closure went into is a loop closure, which the graph can outvote. Odometry
-    is also combined with odometry alone, so that the path of odometry through all vertices remains: it
-    keeps the graph connected whatever is outvoted.
+    An edge that any loop closure went into is composed, and the graph can outvote it as it can a
+    closure. Odometry is also combined with odometry alone, so that the path of odometry through all
+    vertices remains: it keeps the graph connected whatever is outvoted.
 
-    A vertex that ends up with too many edges loses the loop closures that are worth least: those between
-    vertices that a third one ties together more firmly than they do.
+    A vertex that ends up with too many edges loses those that are worth least, but no odometry: those
+    between vertices that a third one ties together more firmly than they do.
 
     Attributes:
         arms: how many of the strongest arms are meshed.
@@ -99,7 +99,7 @@ class ChowLiu:
     (IJRR 2012): of all trees, the one of most mutual information (Chow and Liu 1968); its edges have the
     relative covariances of the exact marginal, the optimum for a tree (Mazuran, Burgard and Tipaldi,
     *Nonlinear factor recovery for long-term SLAM*, IJRR 2016). An edge that comes of odometry alone
-    remains odometry, all others count as loop closures.
+    remains odometry, all others are composed.
     """
 
     leaves_edges: ClassVar[bool] = True
@@ -148,7 +148,7 @@ class _Star:
 
     @classmethod
     def around(cls, graph: PoseGraph, vertex: int) -> "_Star":
-        """Return the star of a vertex, edges of one kind to one neighbour fused."""
+        """Return the star of a vertex, edges to one neighbour fused, odometry apart from the others."""
         arms = _parallel_fused(graph.incident(vertex), vertex)
         T_vertex_map = gtsam.Pose3(invert(graph.pose(vertex)))
         residuals = np.zeros((len(arms), 6))
@@ -185,17 +185,16 @@ class _Star:
         motion = gtsam.Pose3(first.T_source_target).between(outward)
         if shift is not None:
             motion = motion.compose(gtsam.Pose3.Expmap(A @ shift))
-        return Edge(
-            first.target, second.target, motion.matrix(), (C + C.T) / 2, kind_of(first, second)
-        )
+        kind = chained_kind(first, second)
+        return Edge(first.target, second.target, motion.matrix(), (C + C.T) / 2, kind)
 
 
 def _parallel_fused(edges: list[Edge], vertex: int) -> list[Edge]:
-    """Return the edges outward from a vertex, those of one kind to one neighbour fused."""
-    groups: dict[tuple[int, str], list[Edge]] = defaultdict(list)
+    """Return the edges outward from a vertex, fused by neighbour and by whether they are odometry."""
+    groups: dict[tuple[int, bool], list[Edge]] = defaultdict(list)
     for edge in edges:
         arm = outward(edge, vertex)
-        groups[arm.target, arm.kind].append(arm)
+        groups[arm.target, arm.kind == "odometry"].append(arm)
     return [fuse(group) for group in groups.values()]
 
 
@@ -255,7 +254,7 @@ def _equal_forces(star: _Star, i: Indices, j: Indices, information: Array) -> Ar
 def _chains(star: _Star, strong: list[int], lasting: Collection[int]) -> list[tuple[int, int]]:
     """Return each weak arm with the one that it is chained to.
 
-    A loop closure goes with the strongest arm that ends at a lasting vertex, odometry with odometry.
+    Odometry goes with odometry, any other arm with the strongest that ends at a lasting vertex.
     """
     stay = [i for i in strong if star.arms[i].target in lasting]
     hub = max(stay or strong, key=lambda i: float(star.shares[i]))
@@ -268,15 +267,17 @@ def _chains(star: _Star, strong: list[int], lasting: Collection[int]) -> list[tu
 
 
 def _add_fused(graph: PoseGraph, edge: Edge) -> None:
-    """Add an edge, fused with those of its kind that the graph has between the same vertices."""
-    parallel = [e for e in graph.between(edge.source, edge.target) if e.kind == edge.kind]
+    """Add an edge, fused with what the graph has between the same vertices, odometry with odometry."""
+    odometry = edge.kind == "odometry"
+    between = graph.between(edge.source, edge.target)
+    parallel = [e for e in between if (e.kind == "odometry") == odometry]
     for other in parallel:
         graph.remove_edge(other)
     graph.add_edge(fuse([*parallel, edge]), derived=True)
 
 
 def _drop_least_worth(graph: PoseGraph, vertex: int, max_edges: int) -> None:
-    """Drop loop closures from a vertex that has too many edges.
+    """Drop loop closures and composed edges from a vertex that has too many edges.
 
     The worth of an edge is the variance of the best way round over a third vertex relative to its own.
     """

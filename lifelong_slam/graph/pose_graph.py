@@ -5,7 +5,8 @@ is decided by a vote which of all closures are true (robust.py), those that were
 
 Vertices can be removed: what their edges said is then put in by whoever removes them (marginalisation.py).
 A graph may have several components, one for each session that hasn't been located in the map; each is
-held by its root, the vertex that was added without an edge.
+held by its root, the vertex that was added without an edge. In graphs from files, fixed vertices and
+priors hold theirs instead.
 """
 
 import logging
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from lifelong_slam.geometry import invert
 from lifelong_slam.graph.closure_problem import ClosureProblem, Trusted
 from lifelong_slam.graph.robust import fitted, objective, threshold, vote
-from lifelong_slam.result import Edge, GraphSnapshot
+from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
@@ -42,6 +43,8 @@ class PoseGraph:
         self._trust_closures = trust_closures
         self._values = gtsam.Values()
         self._roots: list[int] = []
+        self._fixed: list[int] = []
+        self._priors: dict[int, Prior] = {}  # by the key of their factor
         self._parted = False  # loop closures hold components together, which may fall apart
         self._incident: dict[int, set[int]] = {}  # keys of factors by vertex
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
@@ -69,6 +72,11 @@ class PoseGraph:
         return list(self._roots)
 
     @property
+    def held(self) -> set[int]:
+        """Vertices that hold the others in place: gauges, fixed ones, and those that have priors."""
+        return {*self._gauges(), *self._roots, *(prior.vertex for prior in self._priors.values())}
+
+    @property
     def edges(self) -> list[Edge]:
         """Edges in use: all odometry, and the loop closures that the last vote let in."""
         return [edge for key, edge in self._edges.items() if key not in self._rejected]
@@ -85,7 +93,7 @@ class PoseGraph:
     @property
     def edge_count(self) -> int:
         """Number of edges in use, factors over many vertices included."""
-        return len(self._factors) - len(self._rejected)
+        return len(self._factors) - len(self._priors) - len(self._rejected)
 
     @property
     def rejected(self) -> list[Edge]:
@@ -102,7 +110,8 @@ class PoseGraph:
 
     def snapshot(self) -> GraphSnapshot:
         """Return a copy of the graph as it stands."""
-        return GraphSnapshot(self.poses(), self.edges)
+        priors = tuple(self._priors.values())
+        return GraphSnapshot(self.poses(), self.edges, tuple(self._fixed), priors)
 
     def restore(
         self,
@@ -110,20 +119,29 @@ class PoseGraph:
         edges: Mapping[int, Edge],
         rejected: Collection[int] = (),
         solved: bool = True,
+        fixed: Iterable[int] = (),
+        priors: Iterable[Prior] = (),
     ) -> None:
-        """Fill an empty graph with a whole one; each component hangs on its lowest vertex.
+        """Fill an empty graph with a whole one.
+
+        A component hangs on its fixed vertices and priors; one that has neither hangs on its lowest vertex.
 
         Args:
             poses: (4, 4) T_map_vertex.
             edges: by key, rejected ones among them.
             rejected: keys of the loop closures that are set aside.
             solved: the poses are the optimum of the others; else closures have yet to be accepted.
+            fixed: vertices that keep their poses.
+            priors: of vertices; trusted as odometry is.
         """
         for vertex in sorted(poses):
             self._insert(vertex, poses[vertex])
         for key in sorted(edges):
             self._next_key = key
             self.add_edge(edges[key], derived=solved)
+        self._fixed = list(fixed)
+        for prior in priors:
+            self._add_prior(prior)
         self._rejected = set(rejected)
         self._outvoted = len(self._rejected)
         self._parted = True
@@ -163,7 +181,7 @@ class PoseGraph:
             (edge.source, edge.target),
         )
         self._edges[key] = edge
-        if edge.kind == "loop":
+        if edge.kind != "odometry":
             self._loops.add(key)
             if not derived:
                 self._new.add(key)
@@ -180,9 +198,9 @@ class PoseGraph:
         """Forget a vertex and all edges that meet in it, and return those.
 
         Raises:
-            ValueError: the vertex is a root, without which its component has no place.
+            ValueError: the vertex is a root, is fixed or has a prior: without it others have no place.
         """
-        if vertex in self._roots:
+        if vertex in self._roots or vertex in self._fixed or self._has_prior(vertex):
             raise ValueError(f"vertex {vertex} holds its component in place")
         edges = [self._edges[key] for key in sorted(self._incident[vertex]) if key in self._edges]
         for key in list(self._incident[vertex]):
@@ -340,6 +358,15 @@ class PoseGraph:
             self._incident[vertex].add(key)
         return key
 
+    def _add_prior(self, prior: Prior) -> None:
+        noise = gtsam.noiseModel.Gaussian.Covariance(prior.covariance)
+        measured = gtsam.Pose3(prior.T_map_vertex)
+        factor = gtsam.PriorFactorPose3(prior.vertex, measured, noise)
+        self._priors[self._add(factor, (prior.vertex,))] = prior
+
+    def _has_prior(self, vertex: int) -> bool:
+        return any(prior.vertex == vertex for prior in self._priors.values())
+
     def _forget(self, key: int) -> None:
         for vertex in _vertices(self._factors.pop(key)):
             self._incident[vertex].discard(key)
@@ -410,11 +437,17 @@ class PoseGraph:
         return graph
 
     def _gauges(self) -> list[int]:
-        """Return the oldest root, or vertex where closures set aside have cut it off, of each part."""
+        """Return the fixed vertices, and of each part without any or a prior what else holds it.
+
+        That is the oldest root, or the oldest vertex where closures set aside have cut the part off.
+        """
         if len(self._roots) == 1 and not self._parted:
             return self._roots
-        gauges: list[int] = []
+        gauges = list(self._fixed)
         placed: set[int] = set()
+        for vertex in (*self._fixed, *(prior.vertex for prior in self._priors.values())):
+            if vertex not in placed:
+                placed |= self.component(vertex)
         for vertex in (*self._roots, *self._incident):
             if vertex not in placed:
                 gauges.append(vertex)

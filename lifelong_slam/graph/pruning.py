@@ -128,10 +128,11 @@ class Pruner:
 def protected(graph: PoseGraph) -> set[int]:
     """Return the vertices that hold a graph together.
 
-    These are the roots, which hold a component in its frame, and the articulation vertices in
-    which more than two edges meet: the joints of loops and of sessions. One with two edges is a link of a
-    chain, which marginalisation replaces exactly.
+    These are the vertices that hold a part in its frame (roots, fixed vertices, those with priors, one of a
+    part that only outvoted edges lead to), and the articulation vertices in which more than two edges
+    meet: the joints of loops and of sessions. One with two edges is a link of a chain, which
+    marginalisation replaces exactly.
     """
     structure = networkx.Graph((e.source, e.target) for e in graph.edges)
     joints = networkx.articulation_points(structure)
-    return {*graph.roots, *(vertex for vertex in joints if structure.degree(vertex) > 2)}
+    return graph.held | {vertex for vertex in joints if structure.degree(vertex) > 2}

@@ -2,12 +2,13 @@
 
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import ConfigError
+from lifelong_slam.graph.initialisation import best_start
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.pruning import Pruning
 from lifelong_slam.graph.removal import Removal, recover
@@ -25,8 +26,9 @@ class State:
         poses: T_map_vertex (4, 4) of all vertices that the graph ever had, by id.
         vertices: that it has, lowest first.
         edges: in use.
-        loops: those of them that are loop closures, or come of some.
-        rejected: loop closures that are outvoted.
+        loops: those of them that are loop closures.
+        composed: those of them that are made of several measurements, closures among them.
+        rejected: loop closures and composed edges that are outvoted.
         chi_square: sum of squared Mahalanobis distances of the edges in use.
         seconds: wall time that it took to come here from the state before.
     """
@@ -35,6 +37,7 @@ class State:
     vertices: list[int]
     edges: int
     loops: int
+    composed: int
     rejected: int
     chi_square: float
     seconds: float
@@ -82,12 +85,20 @@ def reduce(
         raise ConfigError(f"keep is a share of the vertices, above 0 and at most 1, not {keep:g}")
     if not snapshot.edges:
         raise ConfigError("the pose graph has no edges: there is nothing to reduce")
-    logger.info("%d vertices, %d edges; optimising ...", len(snapshot.poses), len(snapshot.edges))
+    logger.info(
+        "%d vertices (%d fixed), %d edges, %d priors; optimising ...",
+        len(snapshot.poses),
+        len(snapshot.fixed),
+        len(snapshot.edges),
+        len(snapshot.priors),
+    )
     watch = _Watch()
     graph = loaded(snapshot, planar, robust)
     read = watch.state(graph, [])
+    graph = loaded(replace(snapshot, poses=best_start(snapshot)), planar, robust)
     graph.optimise(reconsider=True)
     optimum = watch.state(graph, [])
+    _warn_of_a_lost_vote(optimum)
     left = max(round(keep * len(graph)), 1)
     logger.info("Optimised in %.1f s; down to %d vertices ...", optimum.seconds, left)
     removals = pruning.reduce(graph, left)
@@ -98,10 +109,24 @@ def reduce(
     )
 
 
+def _warn_of_a_lost_vote(state: State) -> None:
+    """Say that more than half of the closures are out: perhaps it isn't they that are wrong."""
+    every = state.loops + state.composed + state.rejected
+    if 2 * state.rejected > every:
+        logger.warning(
+            "warning: %d of %d loop closures are outvoted%s; if most of them are true, odometry is less"
+            " sure than it claims to be (robust=false trusts them all)",
+            state.rejected,
+            every,
+            ", and only odometry is left" if state.rejected == every else "",
+        )
+
+
 def loaded(snapshot: GraphSnapshot, planar: bool, robust: bool = True) -> PoseGraph:
     """Return a pose graph that is there as a whole, and didn't grow from its root.
 
-    Vertices keep the poses that they are given, and the lowest of each connected part is held.
+    Vertices keep the poses that they are given; what holds a connected part are its fixed vertices and
+    priors, or its lowest vertex.
 
     Args:
         snapshot: not changed.
@@ -109,7 +134,13 @@ def loaded(snapshot: GraphSnapshot, planar: bool, robust: bool = True) -> PoseGr
         robust: let loop closures vote; else all count.
     """
     graph = PoseGraph(planar, trust_closures=not robust)
-    graph.restore(snapshot.poses, dict(enumerate(snapshot.edges)), solved=False)
+    graph.restore(
+        snapshot.poses,
+        dict(enumerate(snapshot.edges)),
+        solved=False,
+        fixed=snapshot.fixed,
+        priors=snapshot.priors,
+    )
     return graph
 
 
@@ -128,6 +159,7 @@ class _Watch:
             vertices=sorted(graph.vertices),
             edges=graph.edge_count,
             loops=sum(edge.kind == "loop" for edge in edges),
+            composed=sum(edge.kind == "composed" for edge in edges),
             rejected=len(graph.rejected),
             chi_square=graph.chi_square(),
             seconds=now - self._last,

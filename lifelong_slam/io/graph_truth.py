@@ -1,5 +1,6 @@
 """True poses of a pose graph's vertices, from the kinds of files in which they come."""
 
+import logging
 from collections.abc import Collection
 from pathlib import Path
 
@@ -9,17 +10,20 @@ from scipy.spatial.transform import Rotation
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.graph.initialisation import chained
-from lifelong_slam.io.g2o import planar_poses, read_g2o
-from lifelong_slam.result import Edge, EdgeKind
+from lifelong_slam.graph.topology import edge_kinds
+from lifelong_slam.io.g2o import read_g2o
+from lifelong_slam.io.g2o_format import planar_poses
+from lifelong_slam.result import Edge
 from lifelong_slam.trajectory import read_tum
 
 Array = NDArray[np.float64]
+logger = logging.getLogger(__name__)
 
 _TORO = {"EDGE2": 3, "EDGE3": 6}  # numbers of a motion: x y theta, x y z roll pitch yaw
 
 
 def read_truth(path: Path, vertices: Collection[int]) -> dict[int, Array]:
-    """Return the true poses (4, 4) of some vertices.
+    """Return the true poses (4, 4) of some vertices, and warn of those that the file lacks.
 
     Args:
         path: a g2o file, whose vertices are taken or, if it has none, chained from its edges; edges between
@@ -28,7 +32,7 @@ def read_truth(path: Path, vertices: Collection[int]) -> dict[int, Array]:
         vertices: ids.
 
     Raises:
-        SourceError: the file is missing or malformed, or lacks one of the vertices.
+        SourceError: the file is missing or malformed, or has none of the vertices.
     """
     if not path.is_file():
         raise SourceError(f"no such file with true poses: {path}")
@@ -45,8 +49,11 @@ def read_truth(path: Path, vertices: Collection[int]) -> dict[int, Array]:
         poses = dict(zip(ids, rows, strict=True))
     missing = set(ids) - set(poses)
     if missing:
-        raise SourceError(f"{path} lacks {len(missing)} vertices, such as {min(missing)}")
-    return {vertex: poses[vertex] for vertex in ids}
+        lack = f"{path} lacks {len(missing)} of {len(ids)} vertices, such as {min(missing)}"
+        if len(missing) == len(ids):
+            raise SourceError(lack)
+        logger.warning("%s: the other %d are judged", lack, len(ids) - len(missing))
+    return {vertex: poses[vertex] for vertex in ids if vertex in poses}
 
 
 def _first_word(path: Path) -> str:
@@ -61,20 +68,20 @@ def _first_word(path: Path) -> str:
 
 
 def _read_toro(path: Path) -> dict[int, Array]:
-    edges = []
+    motions: list[tuple[int, int, Array]] = []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         tag, *fields = line.split() or [""]
         if tag in _TORO:
             try:
-                source, target = int(fields[0]), int(fields[1])
                 motion = _motion(np.array([float(f) for f in fields[2 : 2 + _TORO[tag]]]))
+                motions.append((int(fields[0]), int(fields[1]), motion))
             except (ValueError, IndexError) as error:
                 raise SourceError(f"{path}, line {number}: not a valid {tag}") from error
-            kind: EdgeKind = "odometry" if target == source + 1 else "loop"
-            # Between true poses there is no error.
-            edges.append(Edge(source, target, motion, np.zeros((6, 6)), kind))
+    ends = [(source, target) for source, target, _ in motions]
+    kinds = edge_kinds(ends, list(dict.fromkeys(vertex for pair in ends for vertex in pair)))
+    nothing = np.zeros((6, 6))  # between true poses there is no error
     try:
-        return chained(edges)
+        return chained([Edge(*m, nothing, kind) for m, kind in zip(motions, kinds, strict=True)])
     except ValueError as error:
         raise SourceError(f"{path}: {error}") from error
 

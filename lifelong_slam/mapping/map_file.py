@@ -17,9 +17,25 @@ from lifelong_slam.errors import MapError
 from lifelong_slam.files import atomic_path
 
 _APPLICATION = 0x4C534C4D  # "LSLM"
-_SCHEMA_VERSION = 1
+_SCHEMA_VERSION = 2
+_OLDEST_VERSION = (
+    1  # it has the same tables, but no composed edges: such count as loop closures there
+)
 _SECONDS_TO_WAIT = 0.5  # for others, who may need the file for a moment only
 
+_EDGES = """
+CREATE TABLE edges (
+    id INTEGER PRIMARY KEY,
+    source INTEGER NOT NULL REFERENCES vertices,
+    target INTEGER NOT NULL REFERENCES vertices,
+    kind TEXT NOT NULL CHECK (kind IN ('odometry', 'loop', 'composed')),
+    rejected INTEGER NOT NULL,
+    T_source_target BLOB NOT NULL,
+    covariance BLOB NOT NULL
+) STRICT;
+CREATE INDEX edges_of_source ON edges (source);
+CREATE INDEX edges_of_target ON edges (target);
+"""
 _SCHEMA = f"""
 PRAGMA application_id = {_APPLICATION};
 PRAGMA user_version = {_SCHEMA_VERSION};
@@ -69,17 +85,7 @@ CREATE TABLE submaps (
     id INTEGER PRIMARY KEY REFERENCES vertices ON DELETE CASCADE,
     voxels BLOB NOT NULL
 ) STRICT;
-CREATE TABLE edges (
-    id INTEGER PRIMARY KEY,
-    source INTEGER NOT NULL REFERENCES vertices,
-    target INTEGER NOT NULL REFERENCES vertices,
-    kind TEXT NOT NULL CHECK (kind IN ('odometry', 'loop')),
-    rejected INTEGER NOT NULL,
-    T_source_target BLOB NOT NULL,
-    covariance BLOB NOT NULL
-) STRICT;
-CREATE INDEX edges_of_source ON edges (source);
-CREATE INDEX edges_of_target ON edges (target);
+{_EDGES}
 CREATE TABLE scans (
     id INTEGER PRIMARY KEY,
     session INTEGER NOT NULL REFERENCES sessions,
@@ -90,6 +96,17 @@ CREATE TABLE places (
     id INTEGER PRIMARY KEY REFERENCES keyframes,
     points BLOB NOT NULL
 ) STRICT;
+"""
+_UPGRADE = f"""
+BEGIN;
+ALTER TABLE edges RENAME TO old_edges;
+DROP INDEX edges_of_source;
+DROP INDEX edges_of_target;
+{_EDGES}
+INSERT INTO edges SELECT * FROM old_edges;
+DROP TABLE old_edges;
+PRAGMA user_version = {_SCHEMA_VERSION};
+COMMIT;
 """
 
 
@@ -149,6 +166,8 @@ def connect_to_check(path: Path) -> sqlite3.Connection:
 def connect_to_write(path: Path) -> sqlite3.Connection:
     """Open an undamaged map to go on with it; nobody else can open it meanwhile.
 
+    One of an older format becomes one of this version's.
+
     Raises:
         MapError: there is no map that this version reads, it is damaged, or another process has it
             open; the file stays as it is.
@@ -160,7 +179,10 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("BEGIN IMMEDIATE")
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
         connection.execute("COMMIT")
+        if version < _SCHEMA_VERSION:
+            connection.executescript(_UPGRADE)
     path.with_name(f"{path.name}-shm").unlink(
         missing_ok=True
     )  # a reader's; the lock says it's gone
@@ -220,7 +242,8 @@ def _check_header(path: Path) -> None:
         (version,) = connection.execute("PRAGMA user_version").fetchone()
     if application != _APPLICATION:
         raise MapError(f"{path} is not a map of lifelong_slam")
-    if version != _SCHEMA_VERSION:
+    if not _OLDEST_VERSION <= version <= _SCHEMA_VERSION:
         raise MapError(
-            f"{path} has map format {version}; this version of lifelong_slam knows {_SCHEMA_VERSION}"
+            f"{path} has map format {version}; this version of lifelong_slam knows {_OLDEST_VERSION}"
+            f" to {_SCHEMA_VERSION}"
         )
