@@ -7,6 +7,7 @@ plane are solved as such, with three degrees of freedom a vertex.
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -26,6 +27,7 @@ _PLANAR = np.ix_([3, 4, 2], [3, 4, 2])  # x, y and yaw in the order of Pose3's t
 _FREE_ROTATION = 3.0  # rad: what only closures tie to the rest may be turned any way,
 _FREE_TRANSLATION = 1.0  # and be anywhere: extents of the map
 _ANCHOR_SIGMA = 1e-6  # rad and m
+_DRAWS = 64  # that covariances are estimated from: to a sixth
 _TOLERANCE = 1e-5  # relative change of the error at which an optimisation ends
 
 
@@ -99,7 +101,7 @@ class ClosureProblem:
         return values
 
     def chained(self, poses: Mapping[int, Array]) -> gtsam.Values:
-        """Return the poses that trusted edges lead to, from one vertex of each part that they connect.
+        """Return the poses that trusted edges lead to, from anchors, else from one vertex of each part.
 
         Args:
             poses: (4, 4) T_map_vertex of the vertices to begin with, and of those that no edge leads to.
@@ -108,10 +110,10 @@ class ClosureProblem:
         for link in self._links:
             ends[link.source].append(link)
             ends[link.target].append(reverse(link))
-        placed: dict[int, Array] = {}
+        placed = {vertex: poses[vertex] for vertex in self._held}
         for first in [*self._held, *self.vertices]:
-            front = [] if first in placed else [first]
             placed.setdefault(first, poses[first])
+            front = [first]
             while front:
                 vertex = front.pop()
                 for link in ends[vertex]:
@@ -136,10 +138,12 @@ class ClosureProblem:
             poses |= way.between(poses)
         return poses
 
-    def solve(self, accepted: Iterable[int], start: gtsam.Values) -> tuple[gtsam.Values, float]:
+    def solve(
+        self, accepted: Iterable[int], start: gtsam.Values, iterations: int
+    ) -> tuple[gtsam.Values, float]:
         """Return the optimum with some closures, by index, and its chi-square."""
         params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(20)
+        params.setMaxIterations(iterations)
         params.setRelativeErrorTol(_TOLERANCE)
         optimiser = gtsam.LevenbergMarquardtOptimizer(self._graph(accepted), start, params)
         values = optimiser.optimize()
@@ -244,11 +248,12 @@ class Linearised:
             options={"SymmetricMode": True},
         )
 
-    def sampled_spread(self, count: int) -> Array:
-        """Return (K, d, d) covariances of all predictions, estimated from that many random draws."""
-        noise = np.random.default_rng(0).normal(size=(self._J.shape[0], count))
+    @cached_property
+    def sampled_spread(self) -> Array:
+        """(K, d, d) covariances of all predictions, estimated from random draws: a quick look."""
+        noise = np.random.default_rng(0).normal(size=(self._J.shape[0], _DRAWS))
         draws = self._predictions(np.arange(len(self._A)), self._lu.solve(self._J.T @ noise))
-        spread: Array = draws @ np.swapaxes(draws, 1, 2) / count
+        spread: Array = draws @ np.swapaxes(draws, 1, 2) / _DRAWS
         return spread
 
     def joint_spread(self, closures: NDArray[np.int64]) -> Array:

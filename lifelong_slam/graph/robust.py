@@ -23,7 +23,7 @@ is verified by a nonlinear optimisation, and undone where the objective doesn't 
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import gtsam
@@ -40,16 +40,21 @@ INLIER_PROBABILITY = 0.999  # share of true closures that cost less than the thr
 MOST_SCALE = 3.0  # by which stated standard deviations are believed to be off, either way
 PRIOR_DOF = 30.0  # that the stated standard deviations themselves count for
 
-_ALIKE = 6.0  # in log det: closures that can be judged about as surely are added together
+_GLANCE = 6  # iterations that tell whether a start is promising
+_ITERATIONS = 20  # of an optimisation at most; the next step goes on from there
+_ALIKE = 6.0  # in log det: closures that can be judged about as surely are added together,
+_AT_ONCE = 0.3  # and at least this share of those that fit
 _SEEDS = 400  # closures at most that groups are looked for around
 _MEMBERS = 64  # of a group at most; single steps add the others
 _TRIALS = 3  # steps of a kind at most that are tried before a choice counts as the best
 _RIVALS = 1  # groups at most that are held against the best choice
 _ALLIES = 3  # closures that make such a group; two agree by chance
 _LEAST_GAIN = 1e-3  # in the objective; less is rounding
-_DRAWS = 64  # random ones, for a first look at covariances
 _FEW = 64  # closures that are looked at exactly at once
-_ROUGHLY = 1.5  # by which a change of chi-square may be off at a first look
+_ROUGHLY = 1.3  # by which a sampled covariance may be off
+_LEFT_OPEN = (
+    0.05  # share of a closure's variance that is supposed to be left open, where samples tell
+)
 _HELD = 1e-9  # share of a closure's variance that the others leave open at least
 
 
@@ -112,7 +117,7 @@ def vote(problem: ClosureProblem, starts: Iterable[Start]) -> Choice:
         starts: choices to begin with, by index, and the poses to solve them from.
     """
     search = _Search(problem)
-    begun = [search.choose(frozenset(accepted), values) for accepted, values in starts]
+    begun = [search.choose(frozenset(accepted), values, _GLANCE) for accepted, values in starts]
     best = search.descend(next(filter(search.is_perfect, begun), begun[0]))
     for choice in begun:
         if search.is_perfect(best):
@@ -137,9 +142,11 @@ class _Search:
         self._all = np.arange(len(problem))
         self._limit = threshold(problem.dof)
 
-    def choose(self, accepted: frozenset[int], start: gtsam.Values) -> Choice:
+    def choose(
+        self, accepted: frozenset[int], start: gtsam.Values, iterations: int = _ITERATIONS
+    ) -> Choice:
         """Optimise with some closures."""
-        values, chi_square = self._problem.solve(accepted, start)
+        values, chi_square = self._problem.solve(accepted, start, iterations)
         return Choice(
             accepted, values, chi_square, float(self._objective(chi_square, len(accepted)))
         )
@@ -151,6 +158,7 @@ class _Search:
 
     def descend(self, choice: Choice) -> Choice:
         """Take steps until none makes the objective fall."""
+        choice = self.choose(choice.accepted, choice.values)
         while True:
             choice = self._flipped(choice)
             better = self._with_group(choice)
@@ -166,7 +174,7 @@ class _Search:
         nothing = self.choose(frozenset(), best.values)
         for group in self._groups(nothing, among=~self._mask(best))[:_RIVALS]:
             if len(group) >= _ALLIES:
-                rival = self.descend(self.choose(best.accepted | group, best.values))
+                rival = self.descend(replace(best, accepted=best.accepted | group))
                 if rival.objective < best.objective:
                     best = rival
         return best
@@ -199,7 +207,7 @@ class _Search:
         flips = self._flips(choice, around, ~self._mask(choice), 1)
         if not len(flips.closures):
             return None
-        alike = flips.doubt <= flips.doubt.min() + _ALIKE
+        alike = flips.doubt <= max(flips.doubt.min() + _ALIKE, np.quantile(flips.doubt, _AT_ONCE))
         batch = flips.closures[alike][np.argsort(flips.objective[alike])]
         return self._first_better(choice, batch, choice.accepted.union)
 
@@ -230,12 +238,13 @@ class _Search:
         """
         closures = self._all[asked]
         if len(closures) > _FEW:
-            change, doubt = _change(
-                around.residuals[closures], around.sampled_spread(_DRAWS)[asked], sign
-            )
-            flips = self._falling(choice, closures, change * _ROUGHLY**-sign, doubt, sign)
+            r, spread = around.residuals[closures], around.sampled_spread[asked]
+            change, doubt = _change(r, spread, sign)
+            if sign < 0:  # what the others leave open is a difference, and as rough as both
+                change = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)[0]
+            flips = self._falling(choice, closures, change, doubt, sign)
             if sign > 0 and len(flips.closures) > _FEW:
-                return self._falling(choice, closures, change, doubt, sign)
+                return flips
             closures = flips.closures[np.argsort(flips.objective)][:_FEW]
         if not len(closures):
             return _Flips(closures, np.zeros(0), np.zeros(0))
@@ -275,7 +284,7 @@ class _Search:
             return []
         around = self._problem.linearise(choice.accepted, choice.values)
         if len(closures) > _SEEDS:
-            change, _ = _change(around.residuals, around.sampled_spread(_DRAWS), 1)
+            change, _ = _change(around.residuals, around.sampled_spread, 1)
             closures = np.sort(closures[np.argsort(change[closures], kind="stable")[:_SEEDS]])
         e, Q = around.residuals[closures], around.joint_spread(closures)
         found: list[tuple[float, frozenset[int]]] = []
@@ -302,17 +311,20 @@ class _Flips:
     doubt: Array
 
 
-def _change(residuals: Array, spread: Array, sign: int) -> tuple[Array, Array]:
+def _change(
+    residuals: Array, spread: Array, sign: int, least: float = _HELD
+) -> tuple[Array, Array]:
     """Return the (n,) changes of chi-square by adding (1) or dropping (-1) closures, and their doubt.
 
     Args:
         residuals: (n, d) whitened.
         spread: (n, d, d) whitened covariances of the predictions.
         sign: which.
+        least: eigenvalue of what is left open when one is dropped.
     """
     eigenvalues, V = np.linalg.eigh(np.eye(residuals.shape[1]) + sign * spread)
     # A closure that alone holds something leaves nothing to judge it by when it is dropped.
-    eigenvalues = np.maximum(eigenvalues, _HELD)
+    eigenvalues = np.maximum(eigenvalues, least)
     along = np.einsum("nij,ni->nj", V, residuals)
     return sign * (along**2 / eigenvalues).sum(1), np.log(eigenvalues).sum(1)
 
