@@ -12,7 +12,7 @@ the variance that residuals show over the one that they were given (the referenc
 number; neither does the bound.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,46 +36,41 @@ class Bound:
     which may be as much for each degree of freedom that is gone as it was for each that was redundant.
     No vertex's own distance exceeds the joint one; only where that is too much for one vertex are theirs
     looked at. In a large graph they are those of some vertices, evenly spread: a move that these
-    don't show is local, so that the joint distance shows it.
+    don't show is local, so that the joint distance shows it. Removed vertices count as those that stay.
 
     Attributes:
         variance: the factor s^2, at most 1.
     """
 
-    def __init__(self, graph: PoseGraph, staying: Sequence[int]) -> None:
-        """Keep a graph as it is now.
-
-        Args:
-            graph: at its optimum.
-            staying: vertices that won't be removed.
-        """
+    def __init__(self, graph: PoseGraph) -> None:
+        """Keep a graph as it is now, at its optimum."""
         self._former = graph.checkpoint()
         self._chi_square = graph.chi_square()
         redundant = _DEGREES * (graph.edge_count - len(graph) + len(graph.roots))
         factor = self._chi_square / redundant if redundant > 0 else 1.0
         self.variance = float(np.clip(factor, _LEAST_VARIANCE, 1.0))
-        self._watched = list(staying)[:: len(staying) // _WATCHED + 1]
+        self._watched = graph.vertices[:: len(graph) // _WATCHED + 1]
         self._information: Array | None = None
 
     def allows(self, graph: PoseGraph, removals: Sequence[Removal]) -> bool:
-        """Tell whether what stays is where it may be.
+        """Tell whether vertices are where they may be, or where the former graph would rather have them.
 
         Args:
             graph: what is left, at its optimum.
             removals: all that were made.
         """
-        rise = self._former.chi_square(recover(graph.poses(), removals)) - self._chi_square
+        poses = recover(graph.poses(), removals)
+        rise = self._former.chi_square(poses) - self._chi_square
         if not rise <= _DEGREES * len(removals) * self.variance:
             return False
         most = MAX_DISTANCE * self.variance
-        return rise <= most or bool(self._distances(graph).max(initial=0.0) <= most)
+        return rise <= most or bool(self._distances(poses).max() <= most)
 
-    def _distances(self, graph: PoseGraph) -> Array:
+    def _distances(self, poses: Mapping[int, Array]) -> Array:
         """Return the (n,) squared Mahalanobis distances that the watched vertices have moved."""
         if self._information is None:
             self._information = self._former.marginal_information(self._watched)
-        before = np.array([self._former.pose(i) for i in self._watched]).reshape(-1, 4, 4)
-        after = np.array([graph.pose(i) for i in self._watched]).reshape(-1, 4, 4)
-        moved = log(invert(before) @ after)
+        before = np.array([self._former.pose(i) for i in self._watched])
+        moved = log(invert(before) @ np.array([poses[i] for i in self._watched]))
         distances: Array = np.einsum("ni,nij,nj->n", moved, self._information, moved)
         return distances

@@ -10,21 +10,27 @@ it; `ChowLiu` and `Dense` are what the literature does.
 
 from collections import defaultdict
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import ClassVar, Protocol
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from lifelong_slam.geometry import adjoint, invert
-from lifelong_slam.graph.edges import chain, fuse, outward, reverse
+from lifelong_slam.graph.edges import chain, fuse, kind_of, outward, reverse
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.result import Edge
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
+_MAX_COST = 1.5  # chi-square that a mesh may have at the optimum, over the star's
+_MAX_ANGLE = (
+    0.3  # rad; a larger error isn't of first order on SE(3), and forces aren't what they seem
+)
 _WEAK = 0.01  # share of an arm in what is known about the vertex
 _LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: keeps it invertible
 
@@ -132,8 +138,9 @@ class Dense:
 class _Star:
     """The edges that meet in a vertex, outward, with their errors in its frame."""
 
-    def __init__(self, arms: list[Edge]) -> None:
+    def __init__(self, arms: list[Edge], residuals: Array) -> None:
         self.arms = arms
+        self.residuals = residuals  # (n, 6): arm i ends at Exp(r_i) T_vertex_neighbour
         A = np.array([adjoint(arm.T_source_target) for arm in arms]).reshape(-1, 6, 6)
         covariances = np.array([arm.covariance for arm in arms]).reshape(-1, 6, 6)
         self.covariances = A @ covariances @ np.swapaxes(A, 1, 2)
@@ -145,25 +152,45 @@ class _Star:
     @classmethod
     def around(cls, graph: PoseGraph, vertex: int) -> "_Star":
         """Return the star of a vertex, edges of one kind to one neighbour fused."""
-        return cls(_parallel_fused(graph.incident(vertex), vertex))
+        arms = _parallel_fused(graph.incident(vertex), vertex)
+        T_vertex_map = gtsam.Pose3(invert(graph.pose(vertex)))
+        residuals = np.zeros((len(arms), 6))
+        for i, arm in enumerate(arms):
+            expected = T_vertex_map.compose(gtsam.Pose3(graph.pose(arm.target)))
+            measured = gtsam.Pose3(arm.T_source_target)
+            residuals[i] = gtsam.Pose3.Logmap(expected.compose(measured.inverse()))
+        return cls(arms, residuals)
 
     def __len__(self) -> int:
         return len(self.arms)
 
     def subset(self, indices: list[int]) -> "_Star":
         """Return the star of some of the arms."""
-        return _Star([self.arms[i] for i in indices])
+        return _Star([self.arms[i] for i in indices], self.residuals[indices])
 
     def chained(self, i: int, j: int) -> Edge:
         """Return the edge from one neighbour through the vertex to another, both arms in full."""
         return chain(reverse(self.arms[i]), self.arms[j])
 
-    def edge(self, i: int, j: int, covariance: Array) -> Edge:
-        """Return an edge between the ends of two arms, with a (6, 6) covariance in the vertex's frame."""
-        chained = self.chained(i, j)
-        A = adjoint(invert(self.arms[j].T_source_target))
+    def edge(self, i: int, j: int, covariance: Array, shift: Array | None = None) -> Edge:
+        """Return an edge between two neighbours.
+
+        Args:
+            i: arm to the first.
+            j: arm to the second.
+            covariance: (6, 6) in the vertex's frame.
+            shift: (6,) of the second neighbour against what the two arms measured, likewise.
+        """
+        first, second = self.arms[i], self.arms[j]
+        outward = gtsam.Pose3(second.T_source_target)
+        A = outward.inverse().AdjointMap()
         C = A @ covariance @ A.T
-        return replace(chained, covariance=(C + C.T) / 2)
+        motion = gtsam.Pose3(first.T_source_target).between(outward)
+        if shift is not None:
+            motion = motion.compose(gtsam.Pose3.Expmap(A @ shift))
+        return Edge(
+            first.target, second.target, motion.matrix(), (C + C.T) / 2, kind_of(first, second)
+        )
 
 
 def _parallel_fused(edges: list[Edge], vertex: int) -> list[Edge]:
@@ -198,7 +225,37 @@ def _mesh(star: _Star) -> list[Edge]:
     relative = star.covariances[i] + star.covariances[j]
     spent = np.trace(np.linalg.solve(covariances, relative), axis1=1, axis2=2).sum()
     covariances *= spent / (6 * (len(star) - 1))
-    return [star.edge(*pair, C) for pair, C in zip(pairs, covariances, strict=True)]
+    shifts = _equal_forces(star, i, j, np.linalg.inv(covariances))
+    return [star.edge(*pair, C, d) for pair, C, d in zip(pairs, covariances, shifts, strict=True)]
+
+
+def _equal_forces(star: _Star, i: Indices, j: Indices, information: Array) -> Array:
+    """Return the (K, 6) shifts of edges i -> j with which they pull as the star does.
+
+    At the optimum the arms' forces L_i r_i on the neighbours are in balance with the rest of the graph.
+    Edges with residuals u_j - u_i exert the same where u solves sum_j W_ij (u_i - u_j) = L_i r_i; were
+    the mesh exact, u would be r, and the mesh would cost what the star does. Where it is so far from
+    exact that it would cost much more there is no shift: from one removal to the next such costs would
+    grow without end.
+    """
+    count = len(star)
+    r = star.residuals
+    total = star.information.sum(0)
+    r = r - np.linalg.solve(total, np.einsum("nij,nj->i", star.information, r))
+    ends = np.eye(count)[i] - np.eye(count)[j]  # (K, n) +1 where an edge begins, -1 where it ends
+    laplacian = np.tensordot(ends[:, :, None] * ends[:, None], information, (0, 0)).swapaxes(1, 2)
+    forces = np.einsum("nij,nj->ni", star.information, r)
+    u = np.zeros((count, 6))
+    size = 6 * (count - 1)
+    inner = laplacian[1:, :, 1:].reshape(size, size)
+    u[1:] = np.linalg.solve(inner, forces[1:].ravel()).reshape(-1, 6)
+    plain, pulled = r[j] - r[i], u[j] - u[i]
+    cost = np.einsum("ki,kij,kj", pulled, information, pulled)
+    most = _MAX_COST * np.einsum("ni,nij,nj", r, star.information, r)
+    if cost > most or np.linalg.norm(pulled[:, :3], axis=1).max() > _MAX_ANGLE:
+        return np.zeros_like(plain)
+    shifts: Array = plain - pulled
+    return shifts
 
 
 def _chains(star: _Star, strong: list[int], lasting: Collection[int]) -> list[tuple[int, int]]:

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 CHECKED = "removals checked"  # batches of them
 UNDONE = "removals undone"
 REFUSED = "removals refused"  # of single vertices
+_PATIENCE = 100  # batches undone in one go
 
 
 class Pruning(Protocol):
@@ -93,7 +94,8 @@ class Pruner:
     """Chooses vertices by one rule and marginalises them by another.
 
     They are removed in one batch. Where that moves what stays by too much it is undone, and each half is
-    tried by itself, and so on. A vertex that can't be removed even alone is refused: it stays.
+    tried by itself, and so on. A vertex that can't be removed even alone is refused: it stays. So does,
+    when much has been tried already, a batch that can't be removed as a whole.
     """
 
     def __init__(self, selection: Selection, marginalisation: Marginalisation) -> None:
@@ -143,9 +145,9 @@ class Pruner:
         if not vertices:
             return []
         graph.relax()  # marginals are of first order, and right at the optimum only
-        bound = Bound(graph, sorted(set(graph.vertices) - set(vertices)))
+        bound = Bound(graph)
         removals: list[Removal] = []
-        batches = [vertices]
+        batches, patience = [vertices], _PATIENCE
         while batches:
             batch = batches.pop()
             before = graph.checkpoint()
@@ -156,22 +158,19 @@ class Pruner:
                 removals += made
                 continue
             graph.rollback(before)
-            batches += self._undone(batch)
+            patience -= 1
+            self.counts[UNDONE] += 1
+            if len(batch) > 1 and patience > 0:
+                half = len(batch) // 2
+                batches += batch[half:], batch[:half]
+            else:
+                self.counts[REFUSED] += len(batch)
         return removals
 
     def _marginalise(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> Removal:
         removal = removal_of(graph, vertex)
         self._marginalisation.remove(graph, vertex, lasting)
         return removal
-
-    def _undone(self, batch: list[int]) -> list[list[int]]:
-        """Count a batch that was undone, and return what to try instead, the first at the end."""
-        self.counts[UNDONE] += 1
-        half = len(batch) // 2
-        if not half:
-            self.counts[REFUSED] += 1
-            return []
-        return [batch[half:], batch[:half]]
 
 
 def protected(graph: PoseGraph) -> set[int]:
