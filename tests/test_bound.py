@@ -130,7 +130,9 @@ def gone(count):
 def test_all_together_and_each_by_itself_are_bounded(squared, count, allowed):
     """A chain has no redundancy: its factor is 1. All of the move is the last vertex's own distance."""
     graph, moved = moved_chain(np.sqrt(squared))
-    assert Bound(graph).allows(moved, gone(count)) == allowed
+    bound = Bound(graph)
+    assert bound.allows(moved, gone(count)) == allowed
+    assert (bound._information is None) == (squared < MAX_DISTANCE)  # which takes time
 
 
 def test_of_a_graph_of_many_vertices_some_are_watched():
