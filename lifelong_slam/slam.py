@@ -169,6 +169,7 @@ class LifelongSlam:
                 "loop closures outvoted": len(self._graph.rejected),
                 "keyframes": len(self._track.keyframes),
                 "keyframes pruned": len(self._removals),
+                **self._pruning.counts,
                 **self._end_session(),
             },
         )

@@ -108,6 +108,7 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
         "run": describe_run(arguments, settings.seed),
         "planar": graph.planar,
         **figures(result, judged, truth, graph.planar),
+        "pruning": dict(pruning.counts),
     }
     if settings.json:
         write_json(Path(settings.json), facts)
@@ -185,6 +186,9 @@ def show(facts: dict[str, Any]) -> None:
         f" {facts['moved_all_m']:.4f} m (all)",
         soft_wrap=True,
     )
+    if facts["pruning"]:
+        counts = (f"{count} {name}" for name, count in facts["pruning"].items())
+        console.print(f"Of what was tried: {', '.join(counts)}", soft_wrap=True)
 
 
 _ROWS = (

@@ -98,3 +98,71 @@ def test_in_the_middle_of_two_a_vertex_moves_by_half():
     assert neighbours == [0, 2]
     along = gains[:, 3, 3]
     np.testing.assert_allclose(along, [0.5, 0.5], atol=1e-6)
+
+
+def test_what_is_set_aside_has_no_say_in_how_a_vertex_follows_or_what_is_between_two():
+    truth, odometry, rng = laps(11, 40)
+    loops = [closure(truth, i, i + 30, rng) for i in range(0, 10, 2)]
+    wrong = closure(truth, 4, 34, rng, planar(5, 5, 1))
+    graph, without = graph_of([*odometry, *loops, wrong], 40), graph_of([*odometry, *loops], 40)
+    for each in (graph, without):
+        each.optimise()
+    assert graph.rejected == [wrong]
+    assert graph.between(4, 34) == [loops[2]]
+    neighbours, gains = graph.conditional(4)
+    assert neighbours == [3, 5, 34]
+    np.testing.assert_allclose(gains, without.conditional(4)[1], atol=1e-3)
+    graph.remove_edge(loops[2])
+    assert graph.between(4, 34) == []
+    assert graph.conditional(4)[0] == [3, 5]
+
+
+def test_a_graph_becomes_again_what_its_copy_has_kept():
+    truth, odometry, rng = laps(11, 40)
+    loops = [closure(truth, i, i + 30, rng) for i in range(0, 10, 2)]
+    wrong = closure(truth, 4, 33, rng, planar(5, 5, 1))
+    graph = graph_of([*odometry, *loops, wrong], 40)
+    graph.optimise()
+    poses, edges, chi_square = graph.poses(), graph.edges, graph.chi_square()
+    kept = graph.checkpoint()
+    for _ in range(2):
+        graph.remove_vertex(4)
+        graph.remove_edge(loops[0])
+        graph.add_vertex(50, truth[0])
+        graph.add_odometry(edge(50, 51, planar(1, 0)))
+        graph.add_edge(closure(truth, 1, 31, rng, planar(0.1, 0)))
+        graph.optimise()
+        for each in (kept, graph):
+            if each is graph:
+                graph.rollback(kept)
+            assert each.edges == edges
+            assert each.rejected == [wrong]
+            assert each.roots == [0]
+            assert each.vertices == list(range(40))
+            assert each.incident(4) == [odometry[3], odometry[4], loops[2]]
+            assert each.chi_square() == chi_square
+            assert all((each.pose(i) == T).all() for i, T in poses.items())
+
+
+def test_relaxing_finds_the_optimum_without_a_vote():
+    truth, odometry, rng = laps(12, 40)
+    loops = [closure(truth, i, i + 30, rng) for i in (0, 4, 8)]
+    wrong = closure(truth, 5, 35, rng, planar(5, 5, 1))
+    graph = graph_of([*odometry, *loops, wrong], 40)
+    graph.optimise()
+    assert graph.rejected == [wrong]
+    moved = [T @ exp(0.01 * rng.normal(size=6)) if i else T for i, T in graph.poses().items()]
+    expected = graph.poses().values()
+    for vertex, T in enumerate(moved):
+        graph._values.update(vertex, gtsam.Pose3(T))
+    assert graph.chi_square() == pytest.approx(graph.chi_square(dict(enumerate(moved))))
+    assert graph.chi_square() > 100
+    graph.relax()
+    assert largest_error(graph, expected) < 1e-3
+    assert graph.rejected == [wrong]
+    outlier = closure(truth, 9, 39, rng, planar(1, 0, 0))
+    graph.add_edge(outlier)
+    graph.relax()
+    assert outlier in graph.edges
+    graph.optimise()  # has still to accept it
+    assert graph.rejected == [wrong, outlier]

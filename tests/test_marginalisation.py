@@ -1,6 +1,9 @@
 """Removing vertices: what the graph knows stays, is spent once, and can still be outvoted."""
 
+from itertools import combinations
+
 import gtsam
+import networkx
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -195,6 +198,116 @@ def test_a_mesh_spends_the_information_of_the_star_once():
         assert spent == pytest.approx(6 * len(others), rel=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_of_all_trees_chow_liu_takes_the_one_of_most_mutual_information(seed):
+    """The least entropy: by brute force over all trees, with what GTSAM says of each pair."""
+    rng = np.random.default_rng(seed)
+    draws = np.exp(rng.normal(size=(5, 6)))
+    graph, _ = star_of(rng, 5, covariances=[np.diag((draw * SIGMAS) ** 2) for draw in draws])
+    ends = [0, 2, 3, 4, 5]
+    arms = {end: outward(graph.between(1, end)[0], 1) for end in ends}
+    entropy = {
+        (i, j): np.linalg.slogdet(chain(reverse(arms[i]), arms[j]).covariance)[1]
+        for i, j in combinations(ends, 2)
+    }
+    trees = [t for t in combinations(entropy, 4) if networkx.is_tree(networkx.Graph(t))]
+    assert len(trees) == 5**3  # Cayley
+    best = min(trees, key=lambda tree: sum(entropy[pair] for pair in tree))
+    ChowLiu().remove(graph, 1, ())
+    assert {tuple(sorted((e.source, e.target))) for e in graph.edges} == set(best)
+
+
+def forces_on(graph, vertices):
+    """Return the (n, 6) gradients of half the chi-square by the vertices' tangents, from GTSAM."""
+    nonlinear = graph._nonlinear_graph(graph._loops - graph._rejected)
+    gradient = nonlinear.linearize(graph._values).gradientAtZero()
+    return np.array([gradient.at(i) for i in vertices])
+
+
+def strained(rng, size, spread=0.5, scale=1.0, count=5):
+    """Return a star at its centre's optimum, whose ends are off by about `size` standard deviations."""
+    covariances = []
+    for _ in range(count):
+        Q, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+        S = np.diag(scale * SIGMAS)
+        covariances.append(S @ (Q * np.exp(2 * spread * rng.normal(size=6))) @ Q.T @ S)
+    graph, truth = star_of(rng, count, covariances=covariances)
+    nonlinear = graph._nonlinear_graph(set())
+    for end in truth:
+        if end != 1:
+            pull = exp(size * scale * SIGMAS * rng.normal(size=6))
+            graph._values.update(end, gtsam.Pose3(graph.pose(end) @ pull))
+            held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-9)
+            nonlinear.push_back(gtsam.PriorFactorPose3(end, graph._values.atPose3(end), held))
+    graph._values = gtsam.LevenbergMarquardtOptimizer(nonlinear, graph._values).optimize()
+    return graph
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_mesh_pulls_at_the_neighbours_as_the_star_did(seed):
+    graph = strained(np.random.default_rng(seed), 1.0)
+    others = [2, 3, 4, 5]
+    expected, cost = forces_on(graph, others), graph.chi_square()
+    StarMesh().remove(graph, 1, ())
+    assert np.linalg.norm(forces_on(graph, others) - expected) < 0.02 * np.linalg.norm(expected)
+    assert graph.chi_square() < 1.55 * cost
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_mesh_does_not_pull_so_where_that_would_cost_much_more(seed):
+    """Of arms that agree in nothing the mesh is too far from exact to pull as the star does."""
+    graph = strained(np.random.default_rng(seed), 1e-4, spread=2.0)
+    cost = graph.chi_square()
+    assert 0 < cost < 0.1  # to count in whole units of chi-square would bound nothing
+    StarMesh().remove(graph, 1, ())
+    assert graph.chi_square() < 10 * cost
+
+
+@pytest.mark.parametrize(("scale", "shifted"), [(1.0, True), (1000.0, False)])
+def test_a_mesh_is_shifted_by_small_angles_only(scale, shifted):
+    """Sigmas are 0.0005 rad, where all is linear, or 0.5 rad."""
+    graph = strained(np.random.default_rng(3), 1.0, scale=scale)
+    arms = {end: outward(graph.between(1, end)[0], 1) for end in (2, 3)}
+    StarMesh().remove(graph, 1, ())
+    plain = chain(reverse(arms[2]), arms[3]).T_source_target
+    measured = outward(graph.between(2, 3)[0], 2).T_source_target
+    assert (error_of(measured, plain)[1] > 1e-6) == shifted
+
+
+@pytest.mark.parametrize(("count", "most"), [(4, 0.37), (6, 0.5)])
+def test_where_arms_disagree_a_mesh_is_as_near_as_it_gets(count, most):
+    """Directions in which two arms contradict each other are told to know little, not their opposite."""
+    divergences = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        covariances = []
+        for _ in range(count):
+            Q, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+            D, S = np.exp(rng.normal(size=6)), np.diag(SIGMAS)
+            covariances.append(S @ (Q * D**2) @ Q.T @ S)
+        graph, _ = star_of(rng, count, covariances=covariances)
+        others = list(range(2, count + 1))
+        exact = information(graph, others)
+        StarMesh(arms=count).remove(graph, 1, ())
+        divergences.append(divergence(exact, information(graph, others)) / len(exact))
+    assert np.mean(divergences) < most
+
+
+def test_of_too_many_closures_those_that_others_say_better_go():
+    """From 0 to 4 .. 7 a firm way goes round over 3; two of the closures between are looser than that."""
+    tight = np.diag(SIGMAS**2)
+    graph = PoseGraph()
+    graph.add_vertex(0, np.eye(4))
+    for i in range(1, 8):
+        graph.add_odometry(Edge(i - 1, i, planar(1, 0), 100 * tight, "odometry"))
+    graph.add_edge(Edge(0, 3, planar(3, 0), tight, "loop"))
+    for i, looseness in ((4, 9), (5, 1), (6, 16), (7, 4)):
+        graph.add_edge(Edge(3, i, planar(i - 3.0, 0), tight, "loop"))
+        graph.add_edge(Edge(0, i, planar(i, 0), looseness * tight, "loop"))
+    StarMesh(max_edges=4).remove(graph, 1, ())  # leaves an edge of odometry in its place
+    assert sorted(e.target for e in graph.incident(0) if e.kind == "loop") == [3, 5, 7]
+
+
 def test_dense_marginalisation_keeps_the_information_exactly():
     graph, _ = star_of(np.random.default_rng(7), 5)
     others = [2, 3, 4, 5]
@@ -282,6 +395,33 @@ def test_removed_poses_come_back_where_the_unpruned_optimum_has_them(method):
     assert recovered.keys() == expected.keys()
     for vertex, pose in expected.items():
         assert error_of(recovered[vertex], pose)[0] < 1e-6
+
+
+def test_a_removed_pose_is_where_its_neighbours_would_have_it_wherever_they_go():
+    """They move apart, by a little, and lie around it: against GTSAM's optimum of the vertex alone."""
+    rng = np.random.default_rng(16)
+    graph, _ = star_of(rng, 5, covariances=[random_covariance(rng) for _ in range(5)])
+    lone = graph.checkpoint()
+    removal = removal_of(graph, 1)
+    ends = [0, 2, 3, 4, 5]
+    assert sorted(removal.neighbours) == ends
+    fixed = gtsam.NonlinearFactorGraph(lone._nonlinear_graph(set()))
+    poses = {end: graph.pose(end) @ exp(1e-3 * rng.normal(size=6)) for end in ends[1:]}
+    poses[0] = graph.pose(0)
+    for end, T in poses.items():
+        lone._values.update(end, gtsam.Pose3(T))
+        fixed.push_back(gtsam.NonlinearEqualityPose3(end, gtsam.Pose3(T)))
+    best = gtsam.LevenbergMarquardtOptimizer(fixed, lone._values).optimize().atPose3(1).matrix()
+    moved_by = error_of(best, graph.pose(1))[0]
+    assert moved_by > 5e-4
+    assert error_of(recover(poses, [removal])[1], best)[0] < 0.05 * moved_by
+
+
+def test_the_gains_of_a_removed_vertex_sum_to_one_however_many_neighbours_it_had():
+    graph, _ = star_of(np.random.default_rng(17), 9)
+    removal = removal_of(graph, 1)
+    assert len(removal.neighbours) == 6
+    np.testing.assert_allclose(removal.gains.sum(0), np.eye(6), atol=1e-9)
 
 
 def test_a_removed_pose_follows_when_its_neighbours_move():

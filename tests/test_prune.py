@@ -87,6 +87,12 @@ def test_reduces_a_file_and_tells_what_that_changed(cli, tmp_path, planar):
     assert optimum["ape_all_m"] < 0.5 * read["ape_all_m"]
     assert pruned["ape_staying_m"] < 1.3 * optimum["ape_staying_m"]
     assert facts["moved_all_m"] < 0.5 * optimum["ape_all_m"]
+    assert facts["pruning"] == {
+        "removals checked": 1,
+        "removals undone": 0,
+        "removals refused": 0,
+    }
+    assert "1 removals checked, 0 removals undone, 0 removals refused" in shown
     written, values = gtsam.readG2o(str(out), not planar)
     assert (values.size(), written.size()) == (24, pruned["edges"])
     assert 2 * written.error(values) == pytest.approx(pruned["chi_square"], rel=1e-3)

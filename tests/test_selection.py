@@ -249,6 +249,22 @@ def test_vertices_in_one_place_are_thinned_like_others():
     assert len({tuple(p) for p in survivors(poses, removed)}) == 20
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_density_is_summed_over_three_of_the_spacings_that_are_left(seed):
+    """By the definition: of 60, 20 stay, and stand for three each: the third other is a spacing away."""
+    positions = scattered(seed, 60, 12.0)
+    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
+    reach = 3 * np.median(np.sort(apart, axis=1)[:, 3])
+    pull = np.where((apart <= reach) & (apart > 0), 1 / np.maximum(apart, 1e-9), 0.0)
+    removed, alive = [], np.ones(60, dtype=bool)
+    for _ in range(40):
+        densest = int(np.argmax(np.where(alive, pull @ alive, -1.0)))
+        alive[densest] = False
+        removed.append(densest)
+    poses = at(positions)
+    assert Geometry(1.0).reduce(poses, list(poses), 40) == removed
+
+
 # The others.
 
 

@@ -181,6 +181,8 @@ def test_a_keyframe_is_a_vertex_or_pruned(two_laps, unpruned):
     counts = result.counts
     assert counts["keyframes"] == unpruned[1].counts["keyframes"]
     assert counts["keyframes pruned"] > 0
+    assert counts["removals checked"] > 0
+    assert counts["removals refused"] == 0
     assert len(result.graph.poses) == counts["keyframes"] - counts["keyframes pruned"]
     # Until the end the newest are left alone.
     assert times[-1].vertices - len(result.graph.poses) <= 50

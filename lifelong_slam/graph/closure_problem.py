@@ -122,18 +122,27 @@ class ClosureProblem:
                         front.append(link.target)
         return self.values(placed)
 
-    def relaxed(self, poses: Mapping[int, Array]) -> gtsam.Values:
-        """Return the poses of the chordal relaxation with all closures, which needs no start."""
-        at_ends = {vertex: poses[vertex] for vertex in self.vertices}
-        return self.values(chordal(GraphSnapshot(at_ends, [*self._links, *self._closures])))
+    def relaxed(self, accepted: Iterable[int], values: gtsam.Values) -> gtsam.Values:
+        """Return the poses of the chordal relaxation with some closures, by index, which needs no start.
+
+        Args:
+            accepted: closures.
+            values: poses, of which each part's lowest vertex keeps its own.
+        """
+        edges = [*self._links, *(self._closures[k] for k in sorted(accepted))]
+        return self.values(chordal(GraphSnapshot(self._at_ends(values), edges)))
+
+    def _at_ends(self, values: gtsam.Values) -> dict[int, Array]:
+        """Return the (4, 4) poses of the vertices that are left."""
+        at = values.atPose2 if self._planar else values.atPose3
+        return {vertex: _matrix(at(vertex)) for vertex in self.vertices}
 
     def poses(self, values: gtsam.Values) -> dict[int, Array]:
         """Return (4, 4) poses of all vertices that trusted edges or closures reach.
 
         What was measured along a chain is fitted between its ends, the error spread evenly.
         """
-        at = values.atPose2 if self._planar else values.atPose3
-        poses = {vertex: _matrix(at(vertex)) for vertex in self.vertices}
+        poses = self._at_ends(values)
         for way in self._chains:
             poses |= way.between(poses)
         return poses

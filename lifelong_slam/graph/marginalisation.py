@@ -27,7 +27,10 @@ from lifelong_slam.result import Edge
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_MAX_COST = 1.0  # chi-square by which an edge may be strained to keep the optimum
+_MAX_COST = 1.5  # chi-square that a mesh may have at the optimum, over the star's
+_MAX_ANGLE = (
+    0.3  # rad; a larger error isn't of first order on SE(3), and forces aren't what they seem
+)
 _WEAK = 0.01  # share of an arm in what is known about the vertex
 _LEAST_EIGENVALUE = 1e-2  # of a pair's information, relative to the greatest: keeps it invertible
 
@@ -230,7 +233,9 @@ def _equal_forces(star: _Star, i: Indices, j: Indices, information: Array) -> Ar
 
     At the optimum the arms' forces L_i r_i on the neighbours are in balance with the rest of the graph.
     Edges with residuals u_j - u_i exert the same where u solves sum_j W_ij (u_i - u_j) = L_i r_i; were
-    the mesh exact, u would be r. So the optimum stays where it is.
+    the mesh exact, u would be r, and the mesh would cost what the star does. Where it is so far from
+    exact that it would cost much more there is no shift: from one removal to the next such costs would
+    grow without end.
     """
     count = len(star)
     r = star.residuals
@@ -244,8 +249,9 @@ def _equal_forces(star: _Star, i: Indices, j: Indices, information: Array) -> Ar
     inner = laplacian[1:, :, 1:].reshape(size, size)
     u[1:] = np.linalg.solve(inner, forces[1:].ravel()).reshape(-1, 6)
     plain, pulled = r[j] - r[i], u[j] - u[i]
-    cost = np.einsum("ki,kij,kj->k", pulled, information, pulled)
-    if np.any(cost > _MAX_COST + np.einsum("ki,kij,kj->k", plain, information, plain)):
+    cost = np.einsum("ki,kij,kj", pulled, information, pulled)
+    most = _MAX_COST * np.einsum("ni,nij,nj", r, star.information, r)
+    if cost > most or np.linalg.norm(pulled[:, :3], axis=1).max() > _MAX_ANGLE:
         return np.zeros_like(plain)
     shifts: Array = plain - pulled
     return shifts

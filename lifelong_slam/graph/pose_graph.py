@@ -10,7 +10,9 @@ priors hold theirs instead.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from copy import copy
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -292,9 +294,46 @@ class PoseGraph:
         expected = invert(self.pose(edge.source)) @ self.pose(edge.target)
         return bool(np.linalg.norm((expected - edge.T_source_target)[:3, 3]) > _NEWS)
 
-    def chi_square(self) -> float:
-        """Return the sum of squared Mahalanobis distances of all edges in use."""
-        return self._cost(self._loops - self._rejected)
+    def chi_square(self, poses: Mapping[int, Array] | None = None) -> float:
+        """Return the sum of squared Mahalanobis distances of all edges in use.
+
+        Args:
+            poses: (4, 4) T_map_vertex of all vertices, if not the current ones.
+        """
+        if poses is None:
+            return self._cost(self._loops - self._rejected)
+        values = gtsam.Values()
+        for vertex in self._incident:
+            values.insert(vertex, gtsam.Pose3(poses[vertex]))
+        return 2 * float(self._nonlinear_graph(self._loops - self._rejected).error(values))
+
+    def marginal_information(self, vertices: Sequence[int]) -> Array:
+        """Return the (n, 6, 6) inverse marginal covariances of vertices, relative to their roots.
+
+        They are of the perturbation on the right of T_map_vertex, at the current estimate.
+        """
+        graph = self._nonlinear_graph(self._loops - self._rejected)
+        marginals = gtsam.Marginals(graph, self._values)
+        information = [marginals.marginalInformation(vertex) for vertex in vertices]
+        return np.array(information).reshape(-1, 6, 6)
+
+    def checkpoint(self) -> Self:
+        """Return a copy, which what happens to this graph leaves as it is."""
+        twin = copy(self)
+        twin._values = gtsam.Values(self._values)
+        twin._incident = {vertex: set(keys) for vertex, keys in self._incident.items()}
+        for name in ("_roots", "_factors", "_edges", "_loops", "_rejected", "_new"):
+            setattr(twin, name, copy(getattr(self, name)))
+        return twin
+
+    def rollback(self, checkpoint: Self) -> None:
+        """Become again what a copy of this graph has kept."""
+        self.__dict__.update(checkpoint.checkpoint().__dict__)
+
+    def relax(self) -> None:
+        """Find the poses that fit the edges in use best; none is put to the vote."""
+        graph = self._nonlinear_graph(self._loops - self._rejected)
+        self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm()).optimize()
 
     def optimise(self, reconsider: bool = False) -> None:
         """Find the poses that fit the edges best, and which loop closures are true.
@@ -395,7 +434,8 @@ class PoseGraph:
             self._planar,
         )
         now = problem.values(poses)
-        everything = [(range(len(keys)), now), (range(len(keys)), problem.relaxed(poses))]
+        every = range(len(keys))
+        everything = [(every, now), (every, problem.relaxed(every, now))]
         none = [((), problem.chained(poses))]
         in_use = [([i for i, key in enumerate(keys) if key in established], now)]
         if self._trust_closures:

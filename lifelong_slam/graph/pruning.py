@@ -2,22 +2,31 @@
 
 Kurz, Holoch and Biber, *Geometry-based graph pruning for lifelong SLAM* (IROS 2021): vertices are chosen by
 geometry and marginalised. The newest are left alone until loop closures have had their say about them;
-after that each is settled: it goes, or it stays until others make up for it.
+after that each is settled: it goes, or it stays until others make up for it. What stays has to stay
+where it is, within its covariance (bound.py): a vertex that can't go without moving it isn't removed.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Protocol
 
 import networkx
 import numpy as np
 from numpy.typing import NDArray
 
+from lifelong_slam.graph.bound import Bound
 from lifelong_slam.graph.marginalisation import Marginalisation
 from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.removal import Removal, removal_of
 from lifelong_slam.graph.selection import Selection
 
 Array = NDArray[np.float64]
+
+CHECKED = "removals checked"  # batches of them
+UNDONE = "removals undone"
+REFUSED = "removals refused"  # of single vertices
+_PATIENCE = 100  # batches undone in one go
 
 
 class Pruning(Protocol):
@@ -28,6 +37,11 @@ class Pruning(Protocol):
     """
 
     leaves_edges: bool
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What has happened so far, by name."""
+        ...
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Remove what the graph can do without among vertices that left the window of the newest.
@@ -60,6 +74,7 @@ class NoPruning:
     """Leaves the graph as it is."""
 
     leaves_edges = True
+    counts: Mapping[str, int] = MappingProxyType({})  # nothing happens
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Remove nothing."""
@@ -76,7 +91,12 @@ class NoPruning:
 
 
 class Pruner:
-    """Chooses vertices by one rule and marginalises them by another."""
+    """Chooses vertices by one rule and marginalises them by another.
+
+    They are removed in one batch. Where that moves what stays by too much it is undone, and each half is
+    tried by itself, and so on. A vertex that can't be removed even alone is refused: it stays. So does,
+    when much has been tried already, a batch that can't be removed as a whole.
+    """
 
     def __init__(self, selection: Selection, marginalisation: Marginalisation) -> None:
         """Set up.
@@ -89,6 +109,7 @@ class Pruner:
         self._marginalisation = marginalisation
         self._kept: set[int] = set()
         self.leaves_edges = marginalisation.leaves_edges
+        self.counts: Counter[str] = Counter(dict.fromkeys((CHECKED, UNDONE, REFUSED), 0))
 
     def settle(self, graph: PoseGraph, vertices: Collection[int]) -> list[Removal]:
         """Choose among the given vertices and those that stayed before. See Pruning."""
@@ -98,9 +119,11 @@ class Pruner:
         older = self._kept & connected
         poses = {vertex: graph.pose(vertex) for vertex in (*sorted(older), *vertices)}
         fixed = protected(graph)
-        removed = self._selection.settle(poses, set(vertices) - fixed, older - fixed)
-        self._kept = (self._kept | set(vertices)) - set(removed)
-        return self._remove(graph, removed, self._kept)
+        chosen = self._selection.settle(poses, set(vertices) - fixed, older - fixed)
+        self._kept = (self._kept | set(vertices)) - set(chosen)
+        removals = self._remove(graph, chosen, self._kept)
+        self._kept |= {vertex for vertex in chosen if vertex in graph}
+        return removals
 
     def adopt(
         self, vertices: Collection[int], poses: Mapping[int, Array], hosts: Mapping[int, int]
@@ -118,11 +141,36 @@ class Pruner:
     def _remove(
         self, graph: PoseGraph, vertices: list[int], lasting: Collection[int]
     ) -> list[Removal]:
-        removals = []
-        for vertex in vertices:
-            removals.append(removal_of(graph, vertex))
-            self._marginalisation.remove(graph, vertex, lasting)
+        """Remove vertices, but for those without which the others don't stay where they are."""
+        if not vertices:
+            return []
+        graph.relax()  # marginals are of first order, and right at the optimum only
+        bound = Bound(graph)
+        removals: list[Removal] = []
+        batches, patience = [vertices], _PATIENCE
+        while batches:
+            batch = batches.pop()
+            before = graph.checkpoint()
+            made = [self._marginalise(graph, vertex, lasting) for vertex in batch]
+            graph.relax()
+            self.counts[CHECKED] += 1
+            if bound.allows(graph, [*removals, *made]):
+                removals += made
+                continue
+            graph.rollback(before)
+            patience -= 1
+            self.counts[UNDONE] += 1
+            if len(batch) > 1 and patience > 0:
+                half = len(batch) // 2
+                batches += batch[half:], batch[:half]
+            else:
+                self.counts[REFUSED] += len(batch)
         return removals
+
+    def _marginalise(self, graph: PoseGraph, vertex: int, lasting: Collection[int]) -> Removal:
+        removal = removal_of(graph, vertex)
+        self._marginalisation.remove(graph, vertex, lasting)
+        return removal
 
 
 def protected(graph: PoseGraph) -> set[int]:

@@ -43,7 +43,7 @@ PRIOR_DOF = 30.0  # that the stated standard deviations themselves count for
 _GLANCE = 6  # iterations that tell whether a start is promising
 _ITERATIONS = 20  # of an optimisation at most; the next step goes on from there
 _ALIKE = 6.0  # in log det: closures that can be judged about as surely are added together,
-_AT_ONCE = 0.3  # and at least this share of those that fit
+_AT_ONCE = 0.1  # and at least this share of those that fit
 _SEEDS = 400  # closures at most that groups are looked for around
 _MEMBERS = 64  # of a group at most; single steps add the others
 _TRIALS = 3  # steps of a kind at most that are tried before a choice counts as the best
@@ -161,7 +161,7 @@ class _Search:
         choice = self.choose(choice.accepted, choice.values)
         while True:
             choice = self._flipped(choice)
-            better = self._with_group(choice)
+            better = self._with_group(choice) or self._from_relaxation(choice)
             if better is None:
                 return choice
             choice = better
@@ -263,6 +263,12 @@ class _Search:
         value = self._objective(choice.chi_square + change, len(choice.accepted) + sign)
         falls = value < choice.objective - _LEAST_GAIN
         return _Flips(closures[falls], value[falls], doubt[falls])
+
+    def _from_relaxation(self, choice: Choice) -> Choice | None:
+        """Return the same choice at a better optimum than the one that the steps led to, if there is one."""
+        start = self._problem.relaxed(choice.accepted, choice.values)
+        better = self.choose(choice.accepted, start)
+        return better if better.objective < choice.objective - _LEAST_GAIN else None
 
     def _with_group(self, choice: Choice) -> Choice | None:
         """Add closures that agree with each other, though each alone costs too much."""
