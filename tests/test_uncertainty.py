@@ -5,7 +5,6 @@ import pytest
 from slam_support import PERIOD, Lidar, drive, planar, seconds, town
 
 from lifelong_slam.geometry import exp, invert, log
-from lifelong_slam.loop_closure.closer import relative_covariance
 from lifelong_slam.odometry.kiss_icp import KissIcpOdometry
 from lifelong_slam.odometry.uncertainty import RegistrationNoise, distortion_bias
 from lifelong_slam.registration import Cloud, refine
@@ -78,7 +77,7 @@ def test_bias_is_what_a_registration_makes_of_a_wrong_velocity(lag):
     errors, biases = np.array(pairs).swapaxes(0, 1) * ([15.0] * 3 + [1.0] * 3)  # as seen at 15 m
     agreement = np.sum(errors * biases) / np.sqrt(np.sum(errors**2) * np.sum(biases**2))
     assert agreement > 0.7
-    assert 0.5 < np.linalg.norm(biases) / np.linalg.norm(errors) < 2
+    assert 0.4 < np.linalg.norm(errors) / np.linalg.norm(biases) < 2
 
 
 def test_a_scan_of_an_instant_has_no_distortion():
@@ -101,16 +100,17 @@ def turning_in(t):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_edges_at_the_onset_of_a_turn_are_as_uncertain_as_they_are_wrong(seed):
-    scans = drive(forward_town(seed), FORWARD, turning_in, np.arange(36) * PERIOD)
+def test_poses_at_the_onset_of_a_turn_are_as_uncertain_as_they_are_wrong(seed):
+    scans = drive(forward_town(seed), FORWARD, turning_in, np.arange(28) * PERIOD)
     odometry = KissIcpOdometry(VOXEL, 1.0, 60.0)
     estimates = [odometry.register(scan) for scan in scans]
     truth = np.array([turning_in(seconds(e.stamp)) for e in estimates])
-    squared = []
-    for i in range(14, 28):
-        a, b = estimates[i], estimates[i + 4]
-        motion = invert(a.T_odom_sensor) @ b.T_odom_sensor
-        error = log(invert(invert(truth[i]) @ truth[i + 4]) @ motion)
-        squared.append(error @ np.linalg.solve(relative_covariance(a, b, motion), error))
-    print(np.round(squared, 1), np.mean(squared))
-    assert 1.5 < np.mean(squared) < 24
+    before, turning = 12, slice(20, 27)  # the yaw rate grows from 2.0 to 2.6 s
+    poses = np.array([e.T_odom_sensor for e in estimates])
+    errors = log(invert(invert(truth[before]) @ truth) @ invert(poses[before]) @ poses)
+    sigmas = np.sqrt([np.diag(e.covariance) for e in estimates])
+    ratio = np.linalg.norm(errors[turning, 3:]) / np.linalg.norm(sigmas[turning, 3:])
+    assert 0.5 < ratio < 2
+    assert (
+        np.linalg.norm(sigmas[before, 3:]) < 0.2 * np.linalg.norm(sigmas[turning, 3:], axis=1).max()
+    )
