@@ -16,8 +16,8 @@ from lifelong_slam.geometry import transform
 
 Array = NDArray[np.float64]
 
-# Points that share one error, by way of the neighbours that their planes are fitted to. Measured on samples of
-# one scene whose noise is independent (NEES in tests/test_registration.py).
+# Points that share one error, by way of the neighbours that their planes are fitted to. Measured on
+# samples of one scene whose noise is independent (NEES in tests/test_registration.py).
 CORRELATED_POINTS = 2.0
 PLANE_THICKNESS = 1e-3  # variance across a plane of GICP's model, where that along it is 1
 SURFACE_REACH = 1.0  # metres within which a target point vouches for its plane

@@ -3,8 +3,8 @@
 The Hessian says which motions the surfaces hold, and how well if they were as GICP models them. Two things
 come on top, and both show in how far the constant-velocity prediction was off:
 
-- *Noise* that scans don't share. GICP's model of it is too good in some directions, in pitch above all. It is
-  what is left of the motion when all that is smooth is taken away.
+- *Noise* that scans don't share. GICP's model of it is too good in some directions, in pitch above all.
+  It is what is left of the motion when all that is smooth is taken away.
 - *Distortion.* A sweep is deskewed by one velocity, which lags behind where the sensor accelerates. What
   that does to the pose follows from where the surfaces lie that were swept early and late.
 """
