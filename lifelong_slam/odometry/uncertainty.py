@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 _FORGETTING = 0.05  # weight of the newest scan: a memory of two seconds at 10 Hz
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1, the variance of a third difference of white noise
-_VOTERS = 200  # points that stand for a scan's surfaces; twice as many change no figure
+_VOTERS = 200  # points that stand for a scan's surfaces; 400 changed NEES by a fifth at most
 _CLOCKS = 1000  # points that tell when a place was swept, a third of a degree apart in 360
 _NEIGHBOURS = 10  # points around a voter, itself among them, as many as its plane was fitted to
 
