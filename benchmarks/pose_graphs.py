@@ -30,10 +30,10 @@ from lifelong_slam.config import build
 from lifelong_slam.graph.pruning import NoPruning, Pruning
 from lifelong_slam.graph.reduction import Reduction, reduce
 from lifelong_slam.io.g2o import read_g2o
-from lifelong_slam.io.g2o_reading import FileGraph
 from lifelong_slam.io.graph_truth import read_truth
 from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run, seed_everything
+from lifelong_slam.result import GraphSnapshot
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 KEEP = 1 / 3
@@ -119,11 +119,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows: list[Pruned] = []
     for name in options.graphs:
         graph, truth = read(options.data, name)
-        result = reduce(graph, NoPruning(), keep=1.0, planar=graph.planar)
+        result = reduce(graph, NoPruning(), keep=1.0)
         wholes.append(whole(name, result, truth, graph.planar))
         print(f"{name}: optimised", file=sys.stderr)
         for method, pruning in prunings(options.methods, options.seeds):
-            pruned = reduce(result.graph, pruning, KEEP, graph.planar)
+            pruned = reduce(result.graph, pruning, KEEP)
             rows.append(compare(name, method, pruned, truth, graph.planar))
             print(f"{name}, {method}: done", file=sys.stderr)
         if options.out:
@@ -147,7 +147,7 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def read(folder: Path, name: str) -> tuple[FileGraph, dict[int, Array] | None]:
+def read(folder: Path, name: str) -> tuple[GraphSnapshot, dict[int, Array] | None]:
     """Read a graph and, if there is one, its truth."""
     graph = read_g2o(folder / f"{name}.g2o")
     truth = GRAPHS.get(name)

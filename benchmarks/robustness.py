@@ -3,17 +3,17 @@
     python benchmarks/robustness.py --data $GRAPHS --out outputs/robustness
     python benchmarks/robustness.py --windows 0-300,500-800 --shares 10,30 --seeds 1,2 --sigmas 0.333
 
-Windows of successive vertices are cut out of a graph whose closures are true, and closures that claim two random
-vertices to be in one place are added, as sure of themselves as a true one, as a share of all closures. Each graph
-is solved from the poses in its file by
+Windows of successive vertices are cut out of a graph whose closures are true, and closures that claim two
+random vertices to be in one place are added, as sure of themselves as a true one, as a share of all
+closures. Each graph is solved from the poses in its file by
 
 - odometry: without any closure,
 - least squares: with all of them,
 - GNC: GTSAM's GncLMOptimizer, truncated least squares, 99 %, odometry known to be right,
 - ours: the vote of `lifelong_slam/graph/robust.py`.
 
-The bar is the error with the true closures alone (APE: RMSE after alignment). `--sigmas 0.333` states standard
-deviations of odometry a third as large as the file does. Seconds are CPU time of one process.
+The bar is the error with the true closures alone (APE: RMSE after alignment). `--sigmas 0.333` states
+standard deviations of odometry a third as large as the file does. Seconds are CPU time of one process.
 """
 
 import argparse
@@ -36,10 +36,10 @@ from lifelong_slam.geometry import exp
 from lifelong_slam.graph.closure_problem import ClosureProblem, Trusted
 from lifelong_slam.graph.reduction import loaded
 from lifelong_slam.graph.robust import fitted
-from lifelong_slam.io.g2o import FileGraph, read_g2o
+from lifelong_slam.io.g2o import read_g2o
 from lifelong_slam.io.graph_truth import read_truth
 from lifelong_slam.provenance import describe_run
-from lifelong_slam.result import Edge
+from lifelong_slam.result import Edge, GraphSnapshot
 
 WINDOWS = (
     "0-300",
@@ -124,7 +124,7 @@ def _list(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
     return lambda text: [kind(part) for part in text.split(",")]
 
 
-def cut(graph: FileGraph, window: str, sigmas: float) -> FileGraph:
+def cut(graph: GraphSnapshot, window: str, sigmas: float) -> GraphSnapshot:
     """Return the vertices of a window and the edges among them, odometry's sigmas times a factor."""
     first, end = map(int, window.split("-"))
     inside = range(first, end)
@@ -138,7 +138,7 @@ def cut(graph: FileGraph, window: str, sigmas: float) -> FileGraph:
 
 
 def measure(
-    clean: FileGraph, truth: Mapping[int, Array], window: str, share: float, seed: int
+    clean: GraphSnapshot, truth: Mapping[int, Array], window: str, share: float, seed: int
 ) -> Row:
     """Solve a graph with wrong closures by all methods."""
     true = [edge for edge in clean.edges if edge.kind != "odometry"]
@@ -175,7 +175,7 @@ def measure(
     )
 
 
-def wrong_closures(graph: FileGraph, like: Edge, count: int, seed: int) -> Iterator[Edge]:
+def wrong_closures(graph: GraphSnapshot, like: Edge, count: int, seed: int) -> Iterator[Edge]:
     """Yield closures that claim two random vertices to be in one place."""
     rng = np.random.default_rng(seed)
     ids = sorted(graph.poses)
@@ -187,15 +187,15 @@ def wrong_closures(graph: FileGraph, like: Edge, count: int, seed: int) -> Itera
         yield Edge(ids[i], ids[max(j, i + 1)], turn, like.covariance, "loop")
 
 
-def by_vote(graph: FileGraph, odometry: int) -> set[int]:
+def by_vote(graph: GraphSnapshot, odometry: int) -> set[int]:
     """Return the closures that our vote lets in."""
-    ours = loaded(graph, graph.planar)
+    ours = loaded(graph)
     ours.optimise(reconsider=True)
     rejected = {id(edge) for edge in ours.rejected}
     return {k for k, edge in enumerate(graph.edges[odometry:]) if id(edge) not in rejected}
 
 
-def by_gnc(graph: FileGraph, odometry: int) -> set[int]:
+def by_gnc(graph: GraphSnapshot, odometry: int) -> set[int]:
     """Return the closures that GTSAM's graduated non-convexity lets in, from the better of two starts."""
     first = min(graph.poses)
     factors = gtsam.NonlinearFactorGraph()
@@ -227,16 +227,16 @@ def pose2(T: Array) -> gtsam.Pose2:
 
 
 def optimum(
-    graph: FileGraph, odometry: Sequence[Edge], accepted: Sequence[Edge]
+    graph: GraphSnapshot, odometry: Sequence[Edge], accepted: Sequence[Edge]
 ) -> dict[int, Array]:
     """Return the poses with some closures, the best from several starts."""
-    trusting = loaded(replace(graph, edges=[*odometry, *accepted]), graph.planar, robust=False)
+    trusting = loaded(replace(graph, edges=[*odometry, *accepted]), robust=False)
     trusting.optimise()
     return trusting.poses()
 
 
 def vote_objective(
-    graph: FileGraph, odometry: Sequence[Edge], closures: Sequence[Edge], accepted: set[int]
+    graph: GraphSnapshot, odometry: Sequence[Edge], closures: Sequence[Edge], accepted: set[int]
 ) -> float:
     """Return what the vote would call a choice of closures, by index: the best from several starts."""
     trusted = Trusted(odometry, [min(graph.poses)])

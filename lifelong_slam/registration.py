@@ -16,7 +16,10 @@ from lifelong_slam.geometry import transform
 
 Array = NDArray[np.float64]
 
-CORRELATED_POINTS = 30.0  # points that share one error (measured by benchmarks/covariance.py)
+# Points that share one error, by way of the neighbours that their planes are fitted to. Measured on
+# samples of one scene whose noise is independent (NEES in tests/test_registration.py).
+CORRELATED_POINTS = 2.0
+PLANE_THICKNESS = 1e-3  # variance across a plane of GICP's model, where that along it is 1
 SURFACE_REACH = 1.0  # metres within which a target point vouches for its plane
 SURFACE_THICKNESS = (
     0.1  # metres off the plane that still count as on it: sensor noise and roughness
@@ -112,17 +115,18 @@ def covariance_of(hessian: Array, error: float, inliers: int) -> Array:
     """Return the (6, 6) covariance of a GICP solution in its Hessian's frame and order.
 
     The inverse Hessian, scaled by the variance that the residuals really show (GICP's plane model
-    only fixes it up to a factor), and by the number of neighbouring points that share one error:
-    taken as independent, thousands of points promise tenths of a millimetre, and no registration
-    keeps that. Directions that the geometry leaves free get a large but finite variance.
+    only fixes it up to a factor), and by the number of neighbouring points that share one error.
+    A point holds the pose in one direction, across its plane, so there are as many residuals as
+    points: those along the plane are in the sum, but of next to no weight. Directions that the
+    geometry leaves free get a large but finite variance.
 
     Args:
         hessian: (6, 6).
         error: GICP's cost at the solution, half a sum of squared Mahalanobis distances.
         inliers: points in that sum.
     """
-    # With two points or fewer nothing is left to tell the variance by but the model's own 1.
-    variance = 2 * error / (3 * inliers - 6) if inliers > 2 else 1.0
+    # With six points or fewer nothing is left to tell the variance by but the model's own 1.
+    variance = 2 * error / (inliers - 6) if inliers > 6 else 1.0
     floor = 1e-9 * np.trace(hessian) * np.eye(6)
     covariance = CORRELATED_POINTS * variance * np.linalg.inv(hessian + floor + 1e-6 * np.eye(6))
     symmetric: Array = (covariance + covariance.T) / 2

@@ -56,12 +56,14 @@ class GraphSnapshot:
         edges: measurements between them; rejected loop closures are not among them.
         fixed: vertices that stay exactly where they are.
         priors: measured poses of vertices.
+        planar: all poses lie in a plane (z, roll and pitch zero), and only what lies in it was measured.
     """
 
     poses: dict[int, NDArray[np.float64]]
     edges: list[Edge]
     fixed: tuple[int, ...] = ()
     priors: tuple[Prior, ...] = ()
+    planar: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,14 +96,14 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
     graph = read_g2o(Path(settings.graph))
     judged = sorted(set(graph.poses) - isolated(graph))
     truth = read_truth(Path(settings.truth), judged) if settings.truth else None
-    result = reduce(graph, pruning, settings.keep, graph.planar, settings.robust)
+    result = reduce(graph, pruning, settings.keep, settings.robust)
     if settings.out:
         if not result.complete:
             raise ConfigError(
                 "this method leaves factors over many vertices, which a g2o file can't hold:"
                 " choose another one, or leave out= away"
             )
-        write_g2o(Path(settings.out), result.graph, graph.planar)
+        write_g2o(Path(settings.out), result.graph)
     facts = {
         "run": describe_run(arguments, settings.seed),
         "planar": graph.planar,

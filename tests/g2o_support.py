@@ -43,7 +43,7 @@ def laps(count=3, planar=False, seed=0, wrong=0):
     poses = {0: np.eye(4)}
     for e in edges[: len(truth) - 1]:
         poses[e.target] = poses[e.source] @ e.T_source_target
-    return GraphSnapshot(poses, edges), dict(enumerate(truth))
+    return GraphSnapshot(poses, edges, planar=planar), dict(enumerate(truth))
 
 
 def planar_variances():

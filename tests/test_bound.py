@@ -14,7 +14,7 @@ from lifelong_slam.geometry import exp, invert, log
 from lifelong_slam.graph.bound import MAX_DISTANCE, Bound
 from lifelong_slam.graph.marginalisation import ChowLiu, Dense, StarMesh
 from lifelong_slam.graph.pruning import CHECKED, REFUSED, UNDONE, Pruner
-from lifelong_slam.graph.reduction import LoadedGraph
+from lifelong_slam.graph.reduction import loaded
 from lifelong_slam.graph.removal import Removal, recover
 from lifelong_slam.graph.selection import Decimate, Random
 from lifelong_slam.result import Edge, GraphSnapshot
@@ -40,7 +40,7 @@ def lattice(seed, sigma, sigma_angle, error=1.0, count=40, scale=1.0):
             sigmas = np.repeat([sigma_angle, sigma], 3) * 2.0 ** rng.uniform(-1, 1, 6)
             Z = invert(truth[i]) @ truth[j] @ exp(error * sigmas * rng.normal(size=6))
             edges.append(Edge(i, j, Z, scale * np.diag(sigmas**2), kind))
-    graph = LoadedGraph(GraphSnapshot(dict(enumerate(truth)), edges), robust=False)
+    graph = loaded(GraphSnapshot(dict(enumerate(truth)), edges), robust=False)
     graph.optimise()
     graph.relax()
     return graph

@@ -21,7 +21,7 @@ from slam_support import (
 
 from lifelong_slam.geometry import invert, log, transform
 from lifelong_slam.loop_closure.closer import relative_covariance
-from lifelong_slam.odometry.kiss_icp import Distortion, KissIcpOdometry
+from lifelong_slam.odometry.kiss_icp import KissIcpOdometry
 from lifelong_slam.scan import NANOSECONDS, Scan
 
 RADIUS, SPEED, HEIGHT = 25.0, 8.0, 1.8
@@ -315,19 +315,3 @@ def test_a_scan_that_ends_when_the_last_one_did_is_survived(short_drive):
     assert stump.end_stamp <= scans[3].end_stamp
     estimates = run([*scans[:4], stump, *scans[5:]])
     assert all(np.isfinite(estimate.T_odom_sensor).all() for estimate in estimates)
-
-
-def test_distortion_learns_the_mean_square_of_deviations():
-    rng = np.random.default_rng(0)
-    distortion, sigma = Distortion(), np.array([1, 2, 3, 10, 20, 30]) * 1e-3
-    history = []
-    for _ in range(2000):
-        distortion.update(rng.normal(scale=sigma), 0.5)
-        history.append(distortion.covariance.copy())
-    expected = np.diag((sigma * 0.25) ** 2)  # half of the deviation in half of the interval
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(np.mean(history[200:], axis=0) / np.outer(scale, scale), np.eye(6),
-                               atol=0.15)  # fmt: skip
-    instant = Distortion()
-    instant.update(np.ones(6), 0.0)
-    np.testing.assert_array_equal(instant.covariance, np.zeros((6, 6)))

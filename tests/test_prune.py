@@ -17,7 +17,7 @@ from lifelong_slam.graph.edges import reverse
 from lifelong_slam.graph.initialisation import best_start, chordal
 from lifelong_slam.graph.marginalisation import Dense, StarMesh
 from lifelong_slam.graph.pruning import NoPruning, Pruner
-from lifelong_slam.graph.reduction import LoadedGraph, reduce
+from lifelong_slam.graph.reduction import loaded, reduce
 from lifelong_slam.graph.selection import Geometry
 from lifelong_slam.io.g2o import read_g2o, write_g2o
 from lifelong_slam.io.g2o_format import planar_poses
@@ -46,9 +46,8 @@ def cli(capsys):
 def write_laps(folder, **settings):
     """Write laps as a g2o file, with the truth as another one, and return their paths."""
     graph, truth = laps(**settings)
-    planar = settings.get("planar", False)
-    write_g2o(folder / "in.g2o", graph, planar)
-    write_g2o(folder / "truth.g2o", GraphSnapshot(truth, []), planar)
+    write_g2o(folder / "in.g2o", graph)
+    write_g2o(folder / "truth.g2o", GraphSnapshot(truth, [], planar=graph.planar))
     return folder / "in.g2o", folder / "truth.g2o"
 
 
@@ -59,7 +58,7 @@ def test_a_part_that_only_closures_set_aside_lead_to_is_held_where_it_is():
     covariance = 1e-4 * np.eye(6)
     poses = {i: np.eye(4) for i in (0, 1, 10, 11)}
     edges = [Edge(i, i + 1, step, covariance, "odometry") for i in (0, 10)]
-    graph = LoadedGraph(GraphSnapshot(poses, [*edges, Edge(1, 10, step, covariance, "loop")]))
+    graph = loaded(GraphSnapshot(poses, [*edges, Edge(1, 10, step, covariance, "loop")]))
     assert graph.component(0) == {0, 1, 10, 11}
     graph._rejected = set(graph._loops)
     assert graph.component(0) == {0, 1}
@@ -173,7 +172,7 @@ def test_a_graph_whose_vertices_say_nothing_finds_its_optimum():
     """From poses that are all the same, Levenberg-Marquardt alone ends in another minimum."""
     graph, truth = laps(seed=4)
     nowhere = GraphSnapshot(dict.fromkeys(graph.poses, np.eye(4)), graph.edges)
-    alone = LoadedGraph(nowhere, robust=False)
+    alone = loaded(nowhere, robust=False)
     alone.optimise()
     result = reduce(nowhere, NoPruning(), keep=1.0)
     assert alone.chi_square() > 10 * result.optimum.chi_square
@@ -419,8 +418,8 @@ def test_fixed_vertices_and_priors_are_written_back(cli, tmp_path, caplog):
     caplog.set_level("INFO")
     graph, truth = laps(planar=True)
     priors = (Prior(33, truth[33], graph.edges[0].covariance),)
-    given = GraphSnapshot(graph.poses | {12: truth[12]}, graph.edges, (12,), priors)
-    write_g2o(tmp_path / "in.g2o", given, planar=True)
+    given = GraphSnapshot(graph.poses | {12: truth[12]}, graph.edges, (12,), priors, planar=True)
+    write_g2o(tmp_path / "in.g2o", given)
     ends = [f"graph={tmp_path / 'in.g2o'}", f"out={tmp_path / 'out.g2o'}"]
     assert cli(*ends, "keep=0.3")[0] == 0
     assert "60 vertices (1 fixed), 99 edges, 1 priors" in caplog.text
@@ -444,8 +443,8 @@ def test_graphs_written_from_new_to_old_are_reduced_as_others_are(cli, tmp_path,
     odometry = [reverse(edge) for edge in reversed(odometry_alone(graph))]
     chosen = loops if closures == "true and wrong" else loops[-10:]
     path = tmp_path / "in.g2o"
-    write_g2o(path, GraphSnapshot(graph.poses, [*odometry, *chosen]), planar=True)
-    write_g2o(tmp_path / "truth.g2o", GraphSnapshot(truth, []), planar=True)
+    write_g2o(path, GraphSnapshot(graph.poses, [*odometry, *chosen]))
+    write_g2o(tmp_path / "truth.g2o", GraphSnapshot(truth, []))
     unnamed(path)
     out, figures = tmp_path / "out.g2o", tmp_path / "figures.json"
     ends = [f"graph={path}", f"truth={tmp_path / 'truth.g2o'}", f"out={out}", f"json={figures}"]
@@ -479,7 +478,7 @@ def test_each_part_that_outvoted_closures_led_to_keeps_a_vertex():
     ids = [*range(8), *range(20, 28)]
     edges = [Edge(i, i + 1, step, np.eye(6), "odometry") for i in ids if i not in (7, 27)]
     edges.append(Edge(7, 20, step, np.eye(6), "loop"))
-    graph = LoadedGraph(GraphSnapshot(dict.fromkeys(ids, np.eye(4)), edges))
+    graph = loaded(GraphSnapshot(dict.fromkeys(ids, np.eye(4)), edges))
     graph._rejected = set(graph._loops)
     graph._solve(set())
     GEOMETRY.reduce(graph, 1)
@@ -492,7 +491,7 @@ def test_what_no_edge_reaches_stays_and_is_not_judged(cli, tmp_path, caplog):
     path, true = write_laps(tmp_path, planar=True)
     cli(f"graph={path}", f"truth={true}", f"json={plain}", "pruning=none")
     lone = planar_poses(np.array([[500.0, 5.0, 1.0]]))[0]
-    write_g2o(path, GraphSnapshot(graph.poses | {1000: lone}, graph.edges), planar=True)
+    write_g2o(path, GraphSnapshot(graph.poses | {1000: lone}, graph.edges))
     ends = [f"graph={path}", f"truth={true}", f"json={figures}", f"out={out}"]
     assert cli(*ends, "keep=0.4")[0] == 0
     assert "no edges lead to 1 of 61 vertices, such as 1000" in caplog.text
@@ -508,7 +507,7 @@ def test_vertices_that_the_truth_lacks_are_not_judged(cli, tmp_path, caplog):
     _, truth = laps(planar=True)
     path, true = write_laps(tmp_path, planar=True)
     known = {i: pose for i, pose in truth.items() if i >= 15}
-    write_g2o(true, GraphSnapshot(known, []), planar=True)
+    write_g2o(true, GraphSnapshot(known, []))
     figures = tmp_path / "f.json"
     ends = [f"graph={path}", f"truth={true}", f"json={figures}"]
     assert cli(*ends, "pruning=none")[0] == 0

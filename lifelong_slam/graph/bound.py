@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert, log
-from lifelong_slam.graph.pose_graph import INLIER_THRESHOLD, PoseGraph
+from lifelong_slam.graph.pose_graph import PoseGraph
 from lifelong_slam.graph.removal import Removal, recover
+from lifelong_slam.graph.robust import threshold
 
 Array = NDArray[np.float64]
 
-MAX_DISTANCE = INLIER_THRESHOLD  # squared Mahalanobis distance of one vertex, in units of s^2
 _DEGREES = 6  # of freedom of a vertex
+MAX_DISTANCE = threshold(_DEGREES)  # squared Mahalanobis distance of one vertex, in units of s^2
 _LEAST_VARIANCE = 1e-4  # of the factor: by a hundredth of a standard deviation anything may move
 _WATCHED = 100  # vertices whose own distances are looked at, at most
 

@@ -1,8 +1,8 @@
 """The least-squares problem that a choice of loop closures leaves, condensed to what closures touch.
 
 Vertices that only link two trusted edges of a chain are eliminated by composing the two, to first order
-(edges.py): a chain between two closures becomes one edge, whatever its length. Graphs whose vertices lie in a
-plane are solved as such, with three degrees of freedom a vertex.
+(edges.py): a chain between two closures becomes one edge, whatever its length. Graphs whose vertices lie
+in a plane are solved as such, with three degrees of freedom a vertex.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -97,7 +97,9 @@ class ClosureProblem:
         """Return the given poses of the vertices that are left."""
         values = gtsam.Values()
         for vertex in self.vertices:
-            values.insert(vertex, self._pose(poses[vertex]))
+            values.insert(
+                vertex, _pose2(poses[vertex]) if self._planar else gtsam.Pose3(poses[vertex])
+            )
         return values
 
     def chained(self, poses: Mapping[int, Array]) -> gtsam.Values:
@@ -206,31 +208,28 @@ class ClosureProblem:
                 vertex = min(part)
                 self._trusted.push_back(self._prior(vertex, poses[vertex], free))
 
-    def _pose(self, T: Array) -> gtsam.Pose2 | gtsam.Pose3:
-        if not self._planar:
-            return gtsam.Pose3(T)
-        return gtsam.Pose2(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
-
     def _between(self, edge: Edge) -> gtsam.NonlinearFactor:
-        covariance = edge.covariance[_PLANAR] if self._planar else edge.covariance
-        kind = gtsam.BetweenFactorPose2 if self._planar else gtsam.BetweenFactorPose3
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        return kind(edge.source, edge.target, self._pose(edge.T_source_target), noise)
+        i, j, T = edge.source, edge.target, edge.T_source_target
+        if self._planar:
+            noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance[_PLANAR])
+            return gtsam.BetweenFactorPose2(i, j, _pose2(T), noise)
+        noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+        return gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), noise)
 
     def _prior(self, vertex: int, T: Array, sigmas: tuple[float, float]) -> gtsam.NonlinearFactor:
         rotation, translation = sigmas
         if self._planar:
             noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([translation, translation, rotation]))
-            return gtsam.PriorFactorPose2(vertex, self._pose(T), noise)
+            return gtsam.PriorFactorPose2(vertex, _pose2(T), noise)
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([rotation, translation], 3))
-        return gtsam.PriorFactorPose3(vertex, self._pose(T), noise)
+        return gtsam.PriorFactorPose3(vertex, gtsam.Pose3(T), noise)
 
 
 class Linearised:
     """A problem around an optimum: what one factorisation tells of all its closures.
 
-    The prediction of a closure is what all that is in use says about it. Residuals and covariances are whitened
-    by the closure's own covariance.
+    The prediction of a closure is what all that is in use says about it. Residuals and covariances are
+    whitened by the closure's own covariance.
 
     Attributes:
         residuals: (K, d), by closure.
@@ -277,7 +276,8 @@ class Linearised:
     def spread(self, closures: NDArray[np.int64]) -> Array:
         """Return the (n, d, d) covariances of the predictions of closures."""
         joint = self.joint_spread(closures)
-        return joint[np.arange(len(joint)), np.arange(len(joint))]
+        own: Array = joint[np.arange(len(joint)), np.arange(len(joint))]
+        return own
 
     def _predictions(self, closures: NDArray[np.int64], changes: Array) -> Array:
         """Return (n, d, m) whitened changes of closures' predictions with (C, m) changes of the poses."""
@@ -358,6 +358,10 @@ def _parts(vertices: Iterable[int], ties: Iterable[tuple[int, int]]) -> list[set
     for vertex, label in zip(index, labels.tolist(), strict=True):
         parts[label].add(vertex)
     return parts
+
+
+def _pose2(T: Array) -> gtsam.Pose2:
+    return gtsam.Pose2(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
 
 
 def _matrix(pose: gtsam.Pose2 | gtsam.Pose3) -> Array:

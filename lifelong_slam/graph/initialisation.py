@@ -90,9 +90,9 @@ def _conditioned(edges: list[Edge]) -> Array:
 
 
 def best_start(graph: GraphSnapshot) -> dict[int, Array]:
-    """Return the graph's own poses or those of the chordal relaxation, whichever fit what is trusted better.
+    """Return the graph's own poses or those of the chordal relaxation, whichever fit better.
 
-    Trusted are odometry and priors. Fixed vertices stay where they are, and parts with priors are also
+    What they have to fit is trusted: odometry and priors. Fixed vertices stay where they are, and parts with priors are also
     tried where these put them.
     """
     candidates = (graph.poses, anchored(graph, graph.poses), anchored(graph, chordal(graph)))

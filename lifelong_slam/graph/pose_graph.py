@@ -1,7 +1,7 @@
 """A pose graph over keyframes, optimised by GTSAM, that no wrong loop closure bends.
 
-Odometry edges are trusted, loop closures are not. A new one that fits comes in at once; when one doesn't, it
-is decided by a vote which of all closures are true (robust.py), those that were left out before among them.
+Odometry edges are trusted, loop closures are not. A new one that fits comes in at once; when one doesn't,
+it is decided by a vote which of all closures are true (robust.py), those rejected before among them.
 
 Vertices can be removed: what their edges said is then put in by whoever removes them (marginalisation.py).
 A graph may have several components, one for each session that hasn't been located in the map; each is
@@ -54,6 +54,7 @@ class PoseGraph:
         self._loops: set[int] = set()
         self._rejected: set[int] = set()
         self._new: set[int] = set()  # loop closures since the last optimisation
+        self._is_optimal = True  # as far as the edges in use go
         self._outvoted = 0  # number of them at the last vote
         self._next_key = 0
 
@@ -113,7 +114,8 @@ class PoseGraph:
     def snapshot(self) -> GraphSnapshot:
         """Return a copy of the graph as it stands."""
         priors = tuple(self._priors.values())
-        return GraphSnapshot(self.poses(), self.edges, tuple(self._fixed), priors)
+        fixed = tuple(self._fixed)
+        return GraphSnapshot(self.poses(), self.edges, fixed, priors, self._planar)
 
     def restore(
         self,
@@ -332,15 +334,18 @@ class PoseGraph:
 
     def relax(self) -> None:
         """Find the poses that fit the edges in use best; none is put to the vote."""
+        if self._is_optimal:
+            return
         graph = self._nonlinear_graph(self._loops - self._rejected)
         self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm()).optimize()
+        self._is_optimal = True
 
     def optimise(self, reconsider: bool = False) -> None:
         """Find the poses that fit the edges best, and which loop closures are true.
 
         Args:
-            reconsider: vote on all loop closures if any is rejected; otherwise they vote only when a new one
-                doesn't fit.
+            reconsider: vote on all loop closures if any is rejected; otherwise they vote only when a
+                new one doesn't fit.
         """
         new = self._new - self._rejected
         established = self._loops - self._rejected - new
@@ -392,6 +397,7 @@ class PoseGraph:
     def _add(self, factor: gtsam.NonlinearFactor, vertices: Iterable[int]) -> int:
         key = self._next_key
         self._next_key += 1
+        self._is_optimal = False
         self._factors[key] = factor
         for vertex in vertices:
             self._incident[vertex].add(key)
@@ -407,6 +413,7 @@ class PoseGraph:
         return any(prior.vertex == vertex for prior in self._priors.values())
 
     def _forget(self, key: int) -> None:
+        self._is_optimal = False
         for vertex in _vertices(self._factors.pop(key)):
             self._incident[vertex].discard(key)
         self._edges.pop(key, None)
@@ -462,6 +469,7 @@ class PoseGraph:
         graph = self._nonlinear_graph(loops)
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values, _lm())
         self._values = optimiser.optimize()
+        self._is_optimal = True
         self._new -= loops
         return 2 * float(optimiser.error())
 

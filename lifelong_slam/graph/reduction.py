@@ -66,7 +66,6 @@ def reduce(
     snapshot: GraphSnapshot,
     pruning: Pruning,
     keep: float,
-    planar: bool = False,
     robust: bool = True,
 ) -> Reduction:
     """Optimise a graph, remove vertices, and optimise what is left.
@@ -75,7 +74,6 @@ def reduce(
         snapshot: not changed; its edges need no particular start.
         pruning: the method.
         keep: share of the vertices that stay, if no more are needed to hold the graph together.
-        planar: all poses lie in a plane.
         robust: let loop closures vote, and leave out those that don't fit; else all count.
 
     Raises:
@@ -93,9 +91,9 @@ def reduce(
         len(snapshot.priors),
     )
     watch = _Watch()
-    graph = loaded(snapshot, planar, robust)
+    graph = loaded(snapshot, robust)
     read = watch.state(graph, [])
-    graph = loaded(replace(snapshot, poses=best_start(snapshot)), planar, robust)
+    graph = loaded(replace(snapshot, poses=best_start(snapshot)), robust)
     graph.optimise(reconsider=True)
     optimum = watch.state(graph, [])
     _warn_of_a_lost_vote(optimum)
@@ -122,7 +120,7 @@ def _warn_of_a_lost_vote(state: State) -> None:
         )
 
 
-def loaded(snapshot: GraphSnapshot, planar: bool, robust: bool = True) -> PoseGraph:
+def loaded(snapshot: GraphSnapshot, robust: bool = True) -> PoseGraph:
     """Return a pose graph that is there as a whole, and didn't grow from its root.
 
     Vertices keep the poses that they are given; what holds a connected part are its fixed vertices and
@@ -130,10 +128,9 @@ def loaded(snapshot: GraphSnapshot, planar: bool, robust: bool = True) -> PoseGr
 
     Args:
         snapshot: not changed.
-        planar: all poses lie in a plane.
         robust: let loop closures vote; else all count.
     """
-    graph = PoseGraph(planar, trust_closures=not robust)
+    graph = PoseGraph(snapshot.planar, trust_closures=not robust)
     graph.restore(
         snapshot.poses,
         dict(enumerate(snapshot.edges)),

@@ -1,24 +1,34 @@
 """Which loop closures are true: a choice among them, and the poses that follow from it.
 
-The objective is that of truncated least squares, with the covariances' common scale unknown. With d degrees of
-freedom a closure and n = d times the number of accepted ones, it is the least value over s^2 of
+The objective is that of truncated least squares with the covariances' common scale unknown. With d
+degrees of freedom a closure and n = d times the number of accepted ones, it is the least value over
+s^2, from 1/9 to 9, of
 
-    (chi^2 + v) / s^2 + (n + v) log s^2 - v + t * (number of rejected ones),    1/9 <= s^2 <= 9.
+    (chi^2 + v) / s^2 + (n + v) log s^2 - v + t * (number of rejected closures).
 
-chi^2 is the sum over all edges in use at the optimum. t is the 0.999 quantile of the chi-square distribution with
-d degrees of freedom: what a closure may cost all edges together and still be true. s is the factor by which the
-stated standard deviations are too small, as in the adjustment of geodetic networks (Baarda, *A testing procedure
-for use in geodetic networks*, 1968): where hundreds of closures agree to a seventh of what they claim, one that
-costs as much as it claims is wrong; and where odometry is three times as sure as it should be, the true ones are
-still let in. Before data tell otherwise s is 1: that counts for v = 30 degrees of freedom.
+chi^2 is the sum over all edges in use at the optimum. t is the 0.999 quantile of the chi-square
+distribution with d degrees of freedom: what a closure may cost all edges together and still be true. s is
+the factor by which stated standard deviations are too small, the variance of unit weight in the adjustment
+of geodetic networks (Baarda, *A testing procedure for use in geodetic networks*, 1968). Where hundreds of
+closures agree to a seventh of what they claim, one that costs as much as it claims is wrong; and where
+odometry is three times as sure as it should be, the true ones still come in. Before data tell otherwise s
+is 1: that counts for v = 30 degrees of freedom.
 
-The choice is found by descent, from several starts, with three kinds of steps. Given an optimum, the change of
-chi^2 by adding or dropping one closure has a closed form: e^T (C + P)^-1 e and r^T (C - P)^-1 r, with e and r its
-residual, C its covariance and P that of its prediction. Closures are added in the order of how sure they can be
-judged, the least P first (shorter loops before longer ones: Olivastri and Pretto, *IPC: incremental probabilistic
-consensus*, 2024), and whole groups that agree given one of their members (pairwise consistency: Mangelson et al.,
-*Pairwise consistent measurement set maximization*, ICRA 2018, here conditional on all that is accepted). Each step
-is verified by a nonlinear optimisation, and undone where the objective doesn't fall.
+What is assumed: odometry is right but for its scale, errors are Gaussian, and wrong closures don't agree
+with each other in greater number than the true ones that contradict them.
+
+The choice is found by descent. Given an optimum, the change of chi^2 by adding or dropping one closure has
+a closed form, e^T (C + P)^-1 e and r^T (C - P)^-1 r, with e and r its residual, C its covariance and P that
+of its prediction by all that is in use. Steps are
+
+- adding closures, those first that can be judged most surely, with the least P (short loops before
+  long ones, as in Olivastri and Pretto, *IPC: incremental probabilistic consensus*, 2024);
+- dropping those whose loss makes the objective fall most;
+- adding a group that agrees given one of its members (pairwise consistency as in Mangelson et al.,
+  *Pairwise consistent measurement set maximization*, ICRA 2018, but conditional on all that is accepted);
+- going over to a better optimum of the same choice, from the chordal relaxation.
+
+Each step is verified by a nonlinear optimisation, and undone where the objective doesn't fall.
 """
 
 import logging
@@ -64,7 +74,12 @@ def threshold(dof: int) -> float:
 
 
 def scale_squared(chi_square: Array, dims: Array) -> Array:
-    """Return the factor s^2 by which variances are too small, given chi-square and its degrees of freedom."""
+    """Return the factor s^2 by which variances are too small.
+
+    Args:
+        chi_square: of all edges in use.
+        dims: degrees of freedom that it has.
+    """
     s2 = (chi_square + PRIOR_DOF) / (dims + PRIOR_DOF)
     scale: Array = np.clip(s2, MOST_SCALE**-2, MOST_SCALE**2)
     return scale
@@ -109,8 +124,8 @@ Start: TypeAlias = tuple[Iterable[int], gtsam.Values]
 def vote(problem: ClosureProblem, starts: Iterable[Start]) -> Choice:
     """Return the best choice of closures that descent finds.
 
-    Descent begins with the first start, and then with each other one that is better than what was found by then.
-    A choice in which all closures are in, and fit as well as they claim to, needs no rival.
+    Descent begins with the first start, and then with each other one that is better than what was found
+    by then. A choice in which all closures are in, and fit as well as they claim to, needs no rival.
 
     Args:
         problem: trusted edges and closures.
@@ -231,16 +246,16 @@ class _Search:
     def _flips(
         self, choice: Choice, around: Linearised, asked: NDArray[np.bool_], sign: int
     ) -> "_Flips":
-        """Return those of the closures that make the objective fall when added (1) or dropped (-1).
+        """Return those closures that make the objective fall when added (1) or dropped (-1).
 
-        Covariances are estimated from random draws first. They are exact where that leaves few to look at, and
-        for what is to be dropped, as dividing by what the others leave open asks for it.
+        Covariances are estimated from random draws first. They are exact where that leaves few to look
+        at, and for what is to be dropped, since what the others leave open is a small difference.
         """
         closures = self._all[asked]
         if len(closures) > _FEW:
             r, spread = around.residuals[closures], around.sampled_spread[asked]
             change, doubt = _change(r, spread, sign)
-            if sign < 0:  # what the others leave open is a difference, and as rough as both
+            if sign < 0:
                 change = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)[0]
             flips = self._falling(choice, closures, change, doubt, sign)
             if sign > 0 and len(flips.closures) > _FEW:
@@ -265,7 +280,7 @@ class _Search:
         return _Flips(closures[falls], value[falls], doubt[falls])
 
     def _from_relaxation(self, choice: Choice) -> Choice | None:
-        """Return the same choice at a better optimum than the one that the steps led to, if there is one."""
+        """Return the same choice at a better optimum than the one that the steps led to."""
         start = self._problem.relaxed(choice.accepted, choice.values)
         better = self.choose(choice.accepted, start)
         return better if better.objective < choice.objective - _LEAST_GAIN else None
@@ -296,16 +311,20 @@ class _Search:
         found: list[tuple[float, frozenset[int]]] = []
         for seed in range(len(closures)):
             members, cost = _agreeing(seed, e, Q, self._limit)
-            if len(members) > 1:
-                value = self._objective(
-                    choice.chi_square + cost, len(choice.accepted) + len(members)
-                )
-                found.append((float(value), frozenset(closures[members].tolist())))
-        distinct: list[frozenset[int]] = []
-        for value, group in sorted(found, key=lambda pair: pair[0]):
-            if value < choice.objective and all(2 * len(group & g) <= len(group) for g in distinct):
-                distinct.append(group)
-        return distinct
+            after = len(choice.accepted) + len(members)
+            value = float(self._objective(choice.chi_square + cost, after))
+            if len(members) > 1 and value < choice.objective:
+                found.append((value, frozenset(closures[members].tolist())))
+        return _distinct([group for _, group in sorted(found, key=lambda pair: pair[0])])
+
+
+def _distinct(groups: Iterable[frozenset[int]]) -> list[frozenset[int]]:
+    """Return those groups of which earlier ones have no more than half."""
+    distinct: list[frozenset[int]] = []
+    for group in groups:
+        if all(2 * len(group & other) <= len(group) for other in distinct):
+            distinct.append(group)
+    return distinct
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,7 +370,7 @@ def _agreeing(seed: int, e: Array, Q: Array, limit: float) -> tuple[NDArray[np.i
     own = np.eye(d) + Q[np.arange(n), np.arange(n)] - gain @ Q[seed]
     cost = np.einsum("ni,ni->n", rest, np.linalg.solve(own, rest[..., None])[..., 0])
     cost[seed] = limit  # it is counted by itself
-    members = np.argsort(cost, kind="stable")[: min(np.count_nonzero(cost < limit), _MEMBERS)]
+    members = np.argsort(cost, kind="stable")[: np.count_nonzero(cost < limit)][:_MEMBERS]
     joint = Q[np.ix_(members, members)] - gain[members, None] @ Q[seed, members]
     joint = joint.swapaxes(1, 2).reshape(len(members) * d, len(members) * d)
     try:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from lifelong_slam.errors import SourceError
 from lifelong_slam.files import atomic_write
 from lifelong_slam.io.g2o_format import SE2, SE3, Format
-from lifelong_slam.io.g2o_reading import FileGraph, LineError, Lines
+from lifelong_slam.io.g2o_reading import LineError, Lines
 from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
@@ -38,18 +38,17 @@ Array = NDArray[np.float64]
 _NO_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n"
 
 
-def write_g2o(path: Path, graph: GraphSnapshot, planar: bool = False) -> None:
+def write_g2o(path: Path, graph: GraphSnapshot) -> None:
     """Write a pose graph in full precision: vertices by id, edges in their order, priors, FIX lines.
 
     Args:
         path: of the file, replaced only once the new one is complete.
         graph: what to write.
-        planar: write the planar part of all poses and covariances, as SE(2).
 
     Raises:
         ValueError: a covariance is singular.
     """
-    form = SE2 if planar else SE3
+    form = SE2 if graph.planar else SE3
     lines = [
         *_vertex_lines(graph, form),
         *_edge_lines(graph.edges, form),
@@ -61,7 +60,7 @@ def write_g2o(path: Path, graph: GraphSnapshot, planar: bool = False) -> None:
             file.write(line.encode())
 
 
-def read_g2o(path: Path) -> FileGraph:
+def read_g2o(path: Path) -> GraphSnapshot:
     """Read the vertices, edges, priors and fixed vertices of a g2o file.
 
     In a file that has no vertices, poses are chained from the edges, odometry as far as it goes.

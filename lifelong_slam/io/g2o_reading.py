@@ -29,17 +29,6 @@ _MOST_ID = 2**63 - 1  # of a vertex
 _LANDMARKS = ("XY", "XYZ", "PLANE", "POINT", "LINE", "BEARING", "LANDMARK", "PROJECT", "CAM")
 
 
-@dataclass(frozen=True, slots=True)
-class FileGraph(GraphSnapshot):
-    """A pose graph as a file has it.
-
-    Attributes:
-        planar: it has SE(2) poses, here as SE(3) poses with z, roll and pitch zero.
-    """
-
-    planar: bool = False
-
-
 class LineError(Exception):
     """A line that can't be used."""
 
@@ -127,7 +116,7 @@ class Lines:
             elif tag.startswith(("VERTEX", "EDGE")):
                 raise _unreadable(number, tag)
 
-    def graph(self) -> FileGraph:
+    def graph(self) -> GraphSnapshot:
         """Return the graph, poses by id.
 
         Raises:
@@ -135,7 +124,7 @@ class Lines:
             ValueError: there are no vertices, and the edges don't connect all of theirs.
         """
         if self._form is None:
-            return FileGraph({}, [])
+            return GraphSnapshot({}, [])
         for tag, count in self._unread.items():
             self._warn("%d lines %s are left out: such a prior can't be used", count, tag)
         self._check_ends()
@@ -143,7 +132,7 @@ class Lines:
         poses = self._poses(self._form) if self._vertices else chained(edges) if edges else {}
         self._check_held(poses)
         priors = self._priors(self._form) + self._positions(self._form, poses)
-        return FileGraph(poses, edges, self._held(), tuple(priors), planar=self._form.planar)
+        return GraphSnapshot(poses, edges, self._held(), tuple(priors), planar=self._form.planar)
 
     def _add(self, number: int, tag: str, fields: list[str], kind: EdgeKind | None) -> None:
         record = _RECORDS[tag]

@@ -9,10 +9,12 @@ What is ours is how they are driven:
 - the first two scans are registered twice, for the motion and then deskewed by it;
 - motions that the model did not predict are checked (`motion_check`);
 - the local map forgets what was seen long ago, and not only what is far away (`recent_map`);
-- each answer is refined against surfaces, which yields its covariance (`surface_refinement`).
+- each answer is refined against surfaces, which yields its covariance (`surface_refinement`), but for what
+  the prediction's miss tells of it (`uncertainty`).
 """
 
 import logging
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -32,37 +34,16 @@ from lifelong_slam.odometry.motion_check import MotionCheck
 from lifelong_slam.odometry.odometry import OdometryEstimate
 from lifelong_slam.odometry.recent_map import RecentMap
 from lifelong_slam.odometry.surface_refinement import SurfaceRefinement
+from lifelong_slam.odometry.uncertainty import RegistrationNoise, distortion_bias
 from lifelong_slam.registration import Cloud
 from lifelong_slam.scan import NANOSECONDS, Scan
 
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
-_FORGETTING = 0.05  # weight of the newest scan: a memory of two seconds at 10 Hz
 _GAP = 3.0  # usual periods without a scan, after which the velocity says little
 _GLANCE = 20_000  # points; ICP thins them to some thousand anyway
 _MIN_POINTS = 50  # in range; fewer say less than the prediction does
-
-
-class Distortion:
-    """How far the motion within a sweep departs from the constant velocity it is deskewed by.
-
-    A velocity that is off by as much as the prediction turned out to be shifts the points at both ends
-    of a sweep by half of that deviation, in opposite directions. They cancel only where surfaces are
-    spread evenly over the sweep; the registration's Hessian says nothing of what remains, and on a
-    swaying car it is the larger error.
-    """
-
-    def __init__(self) -> None:
-        self.covariance: Array = np.zeros((6, 6))
-        self._count = 0
-
-    def update(self, deviation: Array, swept: float) -> None:
-        """Take in a (6,) deviation from the prediction; `swept` is sweep time over scan interval."""
-        shift = deviation * min(swept, 1.0) / 2
-        self._count += 1
-        weight = max(_FORGETTING, 1 / self._count)
-        self.covariance = (1 - weight) * self.covariance + weight * np.outer(shift, shift)
 
 
 class KissIcpOdometry:
@@ -102,7 +83,7 @@ class KissIcpOdometry:
         self._voxel_size = voxel_size
         self._check = MotionCheck(voxel_size)
         self._refinement = SurfaceRefinement(voxel_size)
-        self._distortion = Distortion()
+        self._noise = RegistrationNoise()
         self._velocity: Array = np.zeros(6)  # tangent of T_last_next a second
         self._last: OdometryEstimate | None = None
         self._first_scan: Scan | None = None
@@ -139,7 +120,8 @@ class KissIcpOdometry:
         interval = (scan.middle_stamp - last.stamp) / NANOSECONDS
         predicted = last.T_odom_sensor @ exp(self._velocity * interval)
         guess = self._icp(glance, predicted)
-        if self._is_gap(interval) or self._check.is_suspicious(predicted, guess):
+        gap = self._is_gap(interval)
+        if gap or self._check.is_suspicious(predicted, guess):
             guess = self._check.resolve(glance, last.T_odom_sensor, [guess, predicted])
         # Deskew anew by the mean of the old and the new velocity: the old one lags behind, the new one
         # would feed each registration's noise into the next.
@@ -148,9 +130,13 @@ class KissIcpOdometry:
         T = estimate.T_odom_sensor
         deviation = invert(predicted) @ T
         self._kiss.adaptive_threshold.update_model_deviation(deviation)
-        self._distortion.update(log(deviation), scan.duration / interval)
+        xi = log(deviation)
+        self._noise.update(None if gap else xi)
+        # Where it accelerates steadily, the mean velocity of above lags by what the prediction missed.
+        bias = distortion_bias(estimate.cloud, scan, self._velocity, xi / interval)
         self._velocity = log(invert(last.T_odom_sensor) @ T) / interval
-        return estimate
+        covariance = estimate.covariance + self._noise.covariance + np.outer(bias, bias)
+        return replace(estimate, covariance=covariance)
 
     def _icp(self, points: Array, guess: Array) -> Array:
         """Register points to the local map from a guess, as KISS-ICP does."""
@@ -174,7 +160,6 @@ class KissIcpOdometry:
         self._refinement.insert(cloud, T)
         self._map.update(downsampled, T)
         self._check.remember(downsampled, T)
-        covariance = covariance + self._distortion.covariance
         return OdometryEstimate(scan.middle_stamp, T, covariance, points, cloud)
 
     def _start_over(self, first: Scan, second: Scan) -> OdometryEstimate:
