@@ -183,18 +183,3 @@ def test_a_derived_closure_can_be_outvoted():
     graph.optimise()
     graph.optimise(reconsider=True)
     assert graph.rejected == [wrong]
-
-
-def test_a_set_aside_closure_that_was_removed_no_longer_counts_as_outvoted():
-    """Three closures set aside since the last vote call for another, whatever was forgotten between."""
-    graph, truth, rng = slipped()
-    wrong = closure(truth, 23, 53, rng, planar(4, 2, 0.5))
-    graph.add_edge(wrong)
-    graph.optimise(reconsider=True)
-    graph.optimise(reconsider=True)
-    assert graph.rejected == [wrong]
-    graph.remove_edge(wrong)
-    for i in (0, 5, 10):
-        graph.add_edge(closure(truth, i, i + 30, rng))
-        graph.optimise()
-    assert graph.rejected == []

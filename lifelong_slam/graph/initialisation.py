@@ -92,8 +92,8 @@ def _conditioned(edges: list[Edge]) -> Array:
 def best_start(graph: GraphSnapshot) -> dict[int, Array]:
     """Return the graph's own poses or those of the chordal relaxation, whichever fit better.
 
-    What they have to fit is trusted: odometry and priors. Fixed vertices stay where they are, and parts with priors are also
-    tried where these put them.
+    What they have to fit is trusted: odometry and priors. Fixed vertices stay where they are, and parts
+    with priors are also tried where these put them.
     """
     candidates = (graph.poses, anchored(graph, graph.poses), anchored(graph, chordal(graph)))
     return min(candidates, key=lambda poses: _misfit(graph, poses))

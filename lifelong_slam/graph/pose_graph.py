@@ -26,7 +26,6 @@ from lifelong_slam.result import Edge, GraphSnapshot, Prior
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
-_SEVERAL = 3  # loop closures rejected since the last thorough vote that call for another
 _NEWS = 0.2  # metres; less doesn't mislead the search for loop closures
 _GAUGE_SIGMA = 1e-6  # m and rad; the root defines the frame
 
@@ -55,7 +54,6 @@ class PoseGraph:
         self._rejected: set[int] = set()
         self._new: set[int] = set()  # loop closures since the last optimisation
         self._is_optimal = True  # as far as the edges in use go
-        self._outvoted = 0  # number of them at the last vote
         self._next_key = 0
 
     def __len__(self) -> int:
@@ -147,7 +145,6 @@ class PoseGraph:
         for prior in priors:
             self._add_prior(prior)
         self._rejected = set(rejected)
-        self._outvoted = len(self._rejected)
         self._parted = True
         self._roots = self._gauges()
 
@@ -353,8 +350,7 @@ class PoseGraph:
         if not (reconsider and self._rejected) and self._accept(new, established):
             return
         self._values = before
-        doubtful = len(self._rejected | new) - self._outvoted
-        self._vote(established, thorough=reconsider or not established or doubtful >= _SEVERAL)
+        self._vote(established, thorough=reconsider or not established)
 
     def _accept(self, new: set[int], established: set[int]) -> bool:
         """Solve with new loop closures, and tell whether all of them fit."""
@@ -419,7 +415,6 @@ class PoseGraph:
         self._edges.pop(key, None)
         for keys in (self._loops, self._rejected, self._new):
             keys.discard(key)
-        self._outvoted = min(self._outvoted, len(self._rejected))
 
     def _vote(self, established: set[int], thorough: bool) -> None:
         """Decide which loop closures are in, and solve with them.
@@ -456,8 +451,6 @@ class PoseGraph:
         for root in self._gauges():
             self._move(self.component(root), poses[root] @ invert(self.pose(root)))
         self._solve(loops)
-        if thorough:
-            self._outvoted = len(self._rejected)
         logger.info("%d of %d loop closures are rejected", len(self._rejected), len(self._loops))
 
     def _cost(self, loops: set[int]) -> float:

@@ -33,7 +33,7 @@ Each step is verified by a nonlinear optimisation, and undone where the objectiv
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import gtsam
@@ -50,10 +50,8 @@ INLIER_PROBABILITY = 0.999  # share of true closures that cost less than the thr
 MOST_SCALE = 3.0  # by which stated standard deviations are believed to be off, either way
 PRIOR_DOF = 30.0  # that the stated standard deviations themselves count for
 
-_GLANCE = 6  # iterations that tell whether a start is promising
-_ITERATIONS = 20  # of an optimisation at most; the next step goes on from there
 _ALIKE = 6.0  # in log det: closures that can be judged about as surely are added together,
-_AT_ONCE = 0.1  # and at least this share of those that fit
+_AT_ONCE = 0.05  # and at first at least this share of those that fit
 _SEEDS = 400  # closures at most that groups are looked for around
 _MEMBERS = 64  # of a group at most; single steps add the others
 _TRIALS = 3  # steps of a kind at most that are tried before a choice counts as the best
@@ -132,7 +130,7 @@ def vote(problem: ClosureProblem, starts: Iterable[Start]) -> Choice:
         starts: choices to begin with, by index, and the poses to solve them from.
     """
     search = _Search(problem)
-    begun = [search.choose(frozenset(accepted), values, _GLANCE) for accepted, values in starts]
+    begun = [search.glance(frozenset(accepted), values) for accepted, values in starts]
     best = search.descend(next(filter(search.is_perfect, begun), begun[0]))
     for choice in begun:
         if search.is_perfect(best):
@@ -157,14 +155,17 @@ class _Search:
         self._all = np.arange(len(problem))
         self._limit = threshold(problem.dof)
 
-    def choose(
-        self, accepted: frozenset[int], start: gtsam.Values, iterations: int = _ITERATIONS
-    ) -> Choice:
+    def choose(self, accepted: frozenset[int], start: gtsam.Values) -> Choice:
         """Optimise with some closures."""
-        values, chi_square = self._problem.solve(accepted, start, iterations)
-        return Choice(
-            accepted, values, chi_square, float(self._objective(chi_square, len(accepted)))
-        )
+        return self._choice(accepted, *self._problem.solve(accepted, start))
+
+    def glance(self, accepted: frozenset[int], start: gtsam.Values) -> Choice:
+        """Look whether a start is promising."""
+        return self._choice(accepted, *self._problem.glance(accepted, start))
+
+    def _choice(self, accepted: frozenset[int], values: gtsam.Values, chi_square: float) -> Choice:
+        value = float(self._objective(chi_square, len(accepted)))
+        return Choice(accepted, values, chi_square, value)
 
     def is_perfect(self, choice: Choice) -> bool:
         """Tell whether all closures are in and fit as well as they claim to."""
@@ -188,11 +189,21 @@ class _Search:
         """
         nothing = self.choose(frozenset(), best.values)
         for group in self._groups(nothing, among=~self._mask(best))[:_RIVALS]:
-            if len(group) >= _ALLIES:
-                rival = self.descend(replace(best, accepted=best.accepted | group))
-                if rival.objective < best.objective:
-                    best = rival
+            rival = self._upheld(best, group) if len(group) >= _ALLIES else None
+            if rival and rival.objective < best.objective:
+                best = rival
         return best
+
+    def _upheld(self, best: Choice, group: frozenset[int]) -> Choice | None:
+        """Return what descent makes of a group and the best choice; None if it drops most of the group."""
+        rival = self.choose(best.accepted | group, best.values)
+        while 2 * len(rival.accepted & group) > len(group):
+            around = self._problem.linearise(rival.accepted, rival.values)
+            better = self._with_fewer(rival, around)
+            if better is None:
+                return self.descend(rival)
+            rival = better
+        return None
 
     def _objective(self, chi_square: Array | float, accepted: Array | int) -> Array:
         count = np.asarray(accepted)
@@ -201,9 +212,12 @@ class _Search:
 
     def _flipped(self, choice: Choice) -> Choice:
         """Add and drop closures until no single one makes the objective fall."""
+        at_once = _AT_ONCE
         while True:
             around = self._problem.linearise(choice.accepted, choice.values)
-            better = self._with_fewer(choice, around) or self._with_more(choice, around)
+            better = self._with_fewer(choice, around)
+            at_once = _AT_ONCE if better else 2 * at_once  # as long as nothing is regretted
+            better = better or self._with_more(choice, around, min(at_once, 1.0))
             if better is None:
                 return choice
             choice = better
@@ -217,12 +231,18 @@ class _Search:
         worst = np.argsort(-fall)[: np.count_nonzero(2 * fall > fall.max())]
         return self._first_better(choice, flips.closures[worst], choice.accepted.difference)
 
-    def _with_more(self, choice: Choice, around: Linearised) -> Choice | None:
-        """Add closures, of those that would make the objective fall the ones that can be judged best."""
+    def _with_more(self, choice: Choice, around: Linearised, at_once: float) -> Choice | None:
+        """Add closures, of those that would make the objective fall the ones that can be judged best.
+
+        Args:
+            choice: to add to.
+            around: it.
+            at_once: share of those closures that are added at least.
+        """
         flips = self._flips(choice, around, ~self._mask(choice), 1)
         if not len(flips.closures):
             return None
-        alike = flips.doubt <= max(flips.doubt.min() + _ALIKE, np.quantile(flips.doubt, _AT_ONCE))
+        alike = flips.doubt <= max(flips.doubt.min() + _ALIKE, np.quantile(flips.doubt, at_once))
         batch = flips.closures[alike][np.argsort(flips.objective[alike])]
         return self._first_better(choice, batch, choice.accepted.union)
 
