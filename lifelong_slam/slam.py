@@ -153,6 +153,9 @@ class LifelongSlam:
 
         To be called once, after the last scan.
         """
+        self._graph.optimise()
+        for edge in self._loop_closer.look_back(self._keyframes, self._graph, count=None):
+            self._graph.add_edge(edge)
         self._graph.optimise(reconsider=True)
         self._settle(len(self._window))
         self._save(self._track.scans_after_newest())
@@ -225,17 +228,19 @@ class LifelongSlam:
     def _close_loops(self, keyframe: Keyframe, estimate: OdometryEstimate) -> bool:
         """Look for loop closures; tell whether one is news to the graph."""
         sigma = float(np.sqrt(np.linalg.eigvalsh(self._drift[3:, 3:])[-1]))
+        again = self._loop_closer.look_back(self._keyframes, self._graph)
         edges = self._loop_closer.close(
             keyframe, estimate.cloud, self._keyframes, self._graph, sigma
         )
         news = False
-        for edge in edges:
+        for edge in (*again, *edges):
             news |= self._graph.is_news(edge)
             if edge.target in self._graph.component(edge.source):
                 self._graph.add_edge(edge)
             else:
                 self._graph.join(edge)
-            self._drift = edge.covariance
+        if edges:
+            self._drift = edges[-1].covariance
         return news
 
     def _settle(self, count: int) -> None:

@@ -24,6 +24,7 @@ _SUBMAP_SIZE = 7  # keyframes around the candidate that make up the submap
 _SUBMAP_RADIUS = 13.0  # metres around the candidate that they come from
 _OVERLAP = 100.0  # metres of path; nearer local maps show the same by odometry already
 _LOOK_EVERY = 40.0  # metres without a closure after which appearance is asked
+_AT_A_TIME = 2  # keyframes of a stretch that are looked at again for each new one
 _MAX_TURN = 1.0  # rad; among candidates, those that look the same way are preferred by this scale
 
 
@@ -33,6 +34,9 @@ class LoopCloser:
     Proposals come from the graph where its uncertainty says which vertices are in reach, and from
     appearance wherever no closure has confirmed it for a while. A session that begins in a saved map is
     located in it by appearance.
+
+    A closure after a long way moves what was driven since the last one, which may then be within reach of
+    places that it wasn't before. That stretch is searched again, a few keyframes at a time.
     """
 
     def __init__(
@@ -66,6 +70,8 @@ class LoopCloser:
         self._last_attempt = 0.0
         self._confirmed = 0.0  # metres travelled up to the last closure
         self._last_look = 0.0  # metres travelled when appearance was asked last
+        self._attempts: list[float] = []  # metres travelled at attempts by place since then
+        self._stretch: list[int] = []  # keyframes that a closure has moved, to be looked at again
         self.places = Places(voxel_size, max(min_travel, _OVERLAP))
         self.counts: Counter[str] = Counter()
 
@@ -89,14 +95,63 @@ class LoopCloser:
         reachable = graph.component(query.id)
         edges: list[Edge] = []
         if query.travelled - self._last_attempt >= self._spacing:
-            old = [k for i, k in keyframes.items() if i in reachable and self._is_old(k, query)]
+            old = self._older(query, keyframes, reachable)
             edges += self._by_place(query, cloud, old, graph, sigma)
         local_map = self._local_maps.add(query)
         if local_map is not None and local_map.reference.id in graph:
             edges += self._by_appearance(local_map, query, keyframes, graph, reachable)
         if edges:
+            self._stretch += self._since_confirmed(query, keyframes)
+            self._attempts = []
             self._confirmed = query.travelled
         return edges
+
+    def look_back(
+        self,
+        keyframes: Mapping[int, Keyframe],
+        graph: PoseGraph,
+        count: int | None = _AT_A_TIME,
+    ) -> list[Edge]:
+        """Look for closures again along what earlier ones have moved, and return those that are verified.
+
+        Args:
+            keyframes: of all vertices.
+            graph: where they are, optimised with the closures so far.
+            count: keyframes at most that are tried; None: all that are left.
+        """
+        edges: list[Edge] = []
+        while self._stretch and count != 0:
+            keyframe = keyframes.get(self._stretch.pop())
+            if keyframe is None:  # pruned meanwhile
+                continue
+            old = self._older(keyframe, keyframes, graph.component(keyframe.id))
+            if best := _nearest(old, graph, graph.pose(keyframe.id), self._reach[0], 1):
+                cloud = Cloud.prepare(
+                    keyframe.features.astype(np.float64), self._verifier.voxel_size
+                )
+                edges += self._registered(keyframe, cloud, best[0], old, graph)
+                count = None if count is None else count - 1
+        self.counts["loop in hindsight"] += len(edges)
+        return edges
+
+    def _since_confirmed(self, query: Keyframe, keyframes: Mapping[int, Keyframe]) -> list[int]:
+        """Return keyframes since the last closure, a spacing from each other and from attempts."""
+        tried = [*self._attempts, query.travelled]
+        chosen = []
+        for keyframe in sorted(keyframes.values(), key=lambda keyframe: keyframe.travelled):
+            own = keyframe.session == query.session
+            if own and self._confirmed < keyframe.travelled < query.travelled:
+                apart = np.abs(np.array(tried) - keyframe.travelled)
+                if apart.min() >= self._spacing:
+                    chosen.append(keyframe.id)
+                    tried.append(keyframe.travelled)
+        return chosen
+
+    def _older(
+        self, query: Keyframe, keyframes: Mapping[int, Keyframe], reachable: Collection[int]
+    ) -> list[Keyframe]:
+        """Return the keyframes in the query's frame that were left long enough before it."""
+        return [k for i, k in keyframes.items() if i in reachable and self._is_old(k, query)]
 
     def _by_place(
         self, query: Keyframe, cloud: Cloud, old: list[Keyframe], graph: PoseGraph, sigma: float
@@ -108,21 +163,28 @@ class LoopCloser:
         if not best:
             return []
         self._last_attempt = query.travelled
-        centre = graph.pose(best[0].id)
+        self._attempts.append(query.travelled)
+        return self._registered(query, cloud, best[0], old, graph)
+
+    def _registered(
+        self, query: Keyframe, cloud: Cloud, best: Keyframe, old: list[Keyframe], graph: PoseGraph
+    ) -> list[Edge]:
+        """Register the query to the old keyframes around one of them; return the closure if verified."""
+        here, centre = graph.pose(query.id), graph.pose(best.id)
         around = _nearest(old, graph, centre, _SUBMAP_RADIUS, _SUBMAP_SIZE)
         target = submap(around, [graph.pose(k.id) for k in around], centre)
         verdict, result = self._verifier.verify(target, cloud, [invert(centre) @ here])
         self.counts[f"loop by place: {verdict}"] += 1
         logger.info(
             "loop %d -> %d by place: %s (overlap %.2f, residual %.3f m, degeneracy %.3f)",
-            query.id, best[0].id, verdict,
+            query.id, best.id, verdict,
             result.overlap, result.residual, result.degeneracy,
         )  # fmt: skip
         if verdict is not Verdict.ACCEPTED:
             return []
         T = result.T_target_source
-        covariance = result.covariance + relative_covariance(best[0], query, T)
-        return [Edge(best[0].id, query.id, T, covariance, "loop")]
+        covariance = result.covariance + relative_covariance(best, query, T)
+        return [Edge(best.id, query.id, T, covariance, "loop")]
 
     def _by_appearance(
         self,
