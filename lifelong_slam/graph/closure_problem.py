@@ -54,6 +54,7 @@ class ClosureProblem:
     Attributes:
         closures: keys of the closures, in the order of all arrays over closures.
         dof: degrees of freedom of a vertex, 3 or 6.
+        measured: every closure is one measurement, none is composed of several.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class ClosureProblem:
         """
         self.closures = list(closures)
         self.dof = 3 if planar else 6
+        self.measured = all(edge.kind == "loop" for edge in closures.values())
         self._planar = planar and not trusted.factors
         self._width = 3 if self._planar else 6
         self._closures = list(closures.values())

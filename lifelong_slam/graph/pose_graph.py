@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert
 from lifelong_slam.graph.closure_problem import ClosureProblem, Trusted
-from lifelong_slam.graph.robust import fitted, objective, threshold, vote
+from lifelong_slam.graph.robust import Start, fitted, objective, threshold, vote
 from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
@@ -374,13 +374,13 @@ class PoseGraph:
 
     def _gains(self, before: float, after: float, established: int, new: int) -> bool:
         """Tell whether the vote's objective is less with new closures than without."""
-        rejected = len(self._rejected)
-        return bool(
-            objective(np.array(after), np.array(established + new), np.array(rejected), self._dof)
-            < objective(
-                np.array(before), np.array(established), np.array(rejected + new), self._dof
-            )
+        scaled = all(self._edges[key].kind == "loop" for key in self._loops)
+        accepted = np.array([established, established + new])
+        rejected = len(self._rejected) + np.array([new, 0])
+        without, with_new = objective(
+            np.array([before, after]), accepted, rejected, self._dof, scaled
         )
+        return bool(with_new < without)
 
     @property
     def _dof(self) -> int:
@@ -436,14 +436,13 @@ class PoseGraph:
             self._planar,
         )
         now = problem.values(poses)
-        every = range(len(keys))
-        everything = [(every, now), (every, problem.relaxed(every, now))]
-        none = [((), problem.chained(poses))]
-        in_use = [([i for i, key in enumerate(keys) if key in established], now)]
-        if self._trust_closures:
-            choice = fitted(problem, everything)
-        else:
-            choice = vote(problem, [*none, *in_use, *everything] if thorough else in_use)
+        in_use = [i for i, key in enumerate(keys) if key in established]
+        starts: list[Start] = [(in_use, now)]
+        if thorough or self._trust_closures:
+            every = range(len(keys))
+            everything: list[Start] = [(every, now), (every, problem.relaxed(every, now))]
+            starts = [((), problem.chained(poses)), *starts, *everything]
+        choice = fitted(problem, everything) if self._trust_closures else vote(problem, starts)
         for vertex, T in problem.poses(choice.values).items():
             self._values.update(vertex, gtsam.Pose3(T))
         loops = {keys[i] for i in choice.accepted}

@@ -12,7 +12,8 @@ the factor by which stated standard deviations are too small, the variance of un
 of geodetic networks (Baarda, *A testing procedure for use in geodetic networks*, 1968). Where hundreds of
 closures agree to a seventh of what they claim, one that costs as much as it claims is wrong; and where
 odometry is three times as sure as it should be, the true ones still come in. Before data tell otherwise s
-is 1: that counts for v = 30 degrees of freedom.
+is 1: that counts for v = 30 degrees of freedom. Edges that are composed of others tell nothing of s, as
+what their parts disagreed about is gone; where there are some, s stays 1.
 
 What is assumed: odometry is right but for its scale, errors are Gaussian, and wrong closures don't agree
 with each other in greater number than the true ones that contradict them.
@@ -71,19 +72,9 @@ def threshold(dof: int) -> float:
     return float(chi2.ppf(INLIER_PROBABILITY, dof))
 
 
-def scale_squared(chi_square: Array, dims: Array) -> Array:
-    """Return the factor s^2 by which variances are too small.
-
-    Args:
-        chi_square: of all edges in use.
-        dims: degrees of freedom that it has.
-    """
-    s2 = (chi_square + PRIOR_DOF) / (dims + PRIOR_DOF)
-    scale: Array = np.clip(s2, MOST_SCALE**-2, MOST_SCALE**2)
-    return scale
-
-
-def objective(chi_square: Array, accepted: Array, rejected: Array, dof: int) -> Array:
+def objective(
+    chi_square: Array, accepted: Array, rejected: Array, dof: int, scaled: bool = True
+) -> Array:
     """Return what the vote minimises; see the top of this file.
 
     Args:
@@ -91,11 +82,12 @@ def objective(chi_square: Array, accepted: Array, rejected: Array, dof: int) -> 
         accepted: number of closures among them.
         rejected: number of closures that are left out.
         dof: degrees of freedom of a closure, 3 or 6.
+        scaled: the scale of the covariances is unknown; else it is 1.
     """
-    dims = dof * np.asarray(accepted)
-    s2 = scale_squared(chi_square, dims)
-    fit = (chi_square + PRIOR_DOF) / s2 + (dims + PRIOR_DOF) * np.log(s2) - PRIOR_DOF
-    value: Array = fit + threshold(dof) * np.asarray(rejected)
+    dims = dof * accepted + PRIOR_DOF
+    fit = chi_square + PRIOR_DOF
+    s2 = np.clip(fit / dims, MOST_SCALE**-2, MOST_SCALE**2) if scaled else np.ones(fit.shape)
+    value: Array = fit / s2 + dims * np.log(s2) - PRIOR_DOF + threshold(dof) * rejected
     return value
 
 
@@ -208,7 +200,8 @@ class _Search:
     def _objective(self, chi_square: Array | float, accepted: Array | int) -> Array:
         count = np.asarray(accepted)
         left_out = len(self._all) - count
-        return objective(np.asarray(chi_square), count, left_out, self._problem.dof)
+        scaled = self._problem.measured
+        return objective(np.asarray(chi_square), count, left_out, self._problem.dof, scaled)
 
     def _flipped(self, choice: Choice) -> Choice:
         """Add and drop closures until no single one makes the objective fall."""
