@@ -368,7 +368,7 @@ class PoseGraph:
         fits = all(2 * self._factors[key].error(self._values) <= limit for key in used)
         return (
             fits
-            and after - before <= limit
+            and after - before <= threshold(self._dof * len(new))
             and self._gains(before, after, len(established), len(new))
         )
 

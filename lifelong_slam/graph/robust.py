@@ -124,11 +124,13 @@ def vote(problem: ClosureProblem, starts: Iterable[Start]) -> Choice:
     search = _Search(problem)
     begun = [search.glance(frozenset(accepted), values) for accepted, values in starts]
     best = search.descend(next(filter(search.is_perfect, begun), begun[0]))
+    if search.is_perfect(best):
+        return best
     for choice in begun:
-        if search.is_perfect(best):
-            return best
         if choice.objective < best.objective:
             best = search.descend(choice)
+    if len(begun) > 1:
+        best = search.relaxed(best)
     return search.rivalled(best)
 
 
@@ -169,10 +171,16 @@ class _Search:
         choice = self.choose(choice.accepted, choice.values)
         while True:
             choice = self._flipped(choice)
-            better = self._with_group(choice) or self._from_relaxation(choice)
+            better = self._with_group(choice)
             if better is None:
                 return choice
             choice = better
+
+    def relaxed(self, choice: Choice) -> Choice:
+        """Go on from a better optimum of the same choice, if the chordal relaxation leads to one."""
+        start = self._problem.relaxed(choice.accepted, choice.values)
+        better = self.choose(choice.accepted, start)
+        return self.descend(better) if better.objective < choice.objective - _LEAST_GAIN else choice
 
     def rivalled(self, best: Choice) -> Choice:
         """Return a better choice with closures that agree with each other and not with the best.
@@ -291,12 +299,6 @@ class _Search:
         value = self._objective(choice.chi_square + change, len(choice.accepted) + sign)
         falls = value < choice.objective - _LEAST_GAIN
         return _Flips(closures[falls], value[falls], doubt[falls])
-
-    def _from_relaxation(self, choice: Choice) -> Choice | None:
-        """Return the same choice at a better optimum than the one that the steps led to."""
-        start = self._problem.relaxed(choice.accepted, choice.values)
-        better = self.choose(choice.accepted, start)
-        return better if better.objective < choice.objective - _LEAST_GAIN else None
 
     def _with_group(self, choice: Choice) -> Choice | None:
         """Add closures that agree with each other, though each alone costs too much."""
