@@ -24,8 +24,8 @@ from lifelong_slam.result import Edge, GraphSnapshot
 Array = NDArray[np.float64]
 
 _PLANAR = np.ix_([3, 4, 2], [3, 4, 2])  # x, y and yaw in the order of Pose3's tangent vector
-_FREE_ROTATION = 3.0  # rad: what only closures tie to the rest may be turned any way,
-_FREE_TRANSLATION = 1.0  # and be anywhere: extents of the map
+_FREE_ROTATION = 10.0  # rad: what only closures tie to the rest may be turned any way,
+_FREE_TRANSLATION = 10.0  # and be anywhere: extents of the map
 _ANCHOR_SIGMA = 1e-6  # rad and m
 _GLANCE = 5  # steps from a start
 _ITERATIONS = 12  # of an optimisation at most; the search goes on from there
