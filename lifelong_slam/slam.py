@@ -157,6 +157,8 @@ class LifelongSlam:
         for edge in self._loop_closer.look_back(self._keyframes, self._graph, count=None):
             self._graph.add_edge(edge)
         self._graph.optimise(reconsider=True)
+        if doubt := self._graph.doubt:
+            logger.warning("warning: %s", doubt)
         self._settle(len(self._window))
         self._save(self._track.scans_after_newest())
         poses = recover(self._graph.poses(), self._removals)
@@ -169,7 +171,7 @@ class LifelongSlam:
             graph=graph,
             counts={
                 **self._loop_closer.counts,
-                "loop closures outvoted": len(self._graph.rejected),
+                "loop closures rejected": len(self._graph.rejected),
                 "keyframes": len(self._track.keyframes),
                 "keyframes pruned": len(self._removals),
                 **self._pruning.counts,

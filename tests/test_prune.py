@@ -453,7 +453,7 @@ def test_graphs_written_from_new_to_old_are_reduced_as_others_are(cli, tmp_path,
     assert (read["loops"], read["edges"]) == (len(chosen), 59 + len(chosen))
     assert optimum["rejected"] == 10
     assert pruned["ape_all_m"] == pytest.approx(optimum["ape_all_m"], abs=0.05)
-    lost = "10 of 10 loop closures are outvoted, and only odometry is left"
+    lost = "10 of 10 loop closures are rejected, and only odometry is left"
     assert (lost in caplog.text) == (closures == "wrong")
 
 

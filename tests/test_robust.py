@@ -140,7 +140,7 @@ def test_of_closures_that_agree_in_themselves_the_greater_number_wins(true, wron
 
 
 def test_later_evidence_overturns_what_was_accepted_before():
-    """On the second lap a place is taken for one a little further on, as drift allows, until others are seen."""
+    """On the second lap a place is taken for one further on, as drift allows, until more is seen."""
     truth, odometry, rng = two_laps(2, sigmas=SIGMAS * [1, 1, 5, 5, 5, 1])
     further = invert(truth[0]) @ truth[6]
     alike = [closure(truth, i + 6, i + 40, rng, further) for i in (5, 6, 7, 8)]

@@ -165,7 +165,7 @@ def test_counts_and_graph_tell_the_same_story(unpruned):
     kinds = [edge.kind for edge in result.graph.edges]
     accepted = sum(n for what, n in result.counts.items() if what.endswith(": accepted"))
     accepted += result.counts["loop by appearance"]
-    assert kinds.count("loop") == accepted - result.counts["loop closures outvoted"]
+    assert kinds.count("loop") == accepted - result.counts["loop closures rejected"]
     assert kinds.count("loop") >= 5
     assert kinds.count("odometry") == len(result.graph.poses) - 1
     assert len(result.graph.poses) == result.counts["keyframes"]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert
 from lifelong_slam.graph.closure_problem import ClosureProblem, Trusted
-from lifelong_slam.graph.robust import Start, fitted, objective, threshold, vote
+from lifelong_slam.graph.robust import Start, doubt_about, fitted, objective, threshold, vote
 from lifelong_slam.result import Edge, GraphSnapshot, Prior
 
 Array = NDArray[np.float64]
@@ -83,12 +83,12 @@ class PoseGraph:
         return [edge for key, edge in self._edges.items() if key not in self._rejected]
 
     def keyed_edges(self) -> dict[int, Edge]:
-        """Return all edges by a key that stays theirs, those set aside among them."""
+        """Return all edges by a key that stays theirs, rejected ones among them."""
         return dict(self._edges)
 
     @property
     def rejected_keys(self) -> frozenset[int]:
-        """Keys of the loop closures that are set aside."""
+        """Keys of the loop closures that are rejected."""
         return frozenset(self._rejected)
 
     @property
@@ -100,6 +100,11 @@ class PoseGraph:
     def rejected(self) -> list[Edge]:
         """Loop closures that the last vote left out."""
         return [self._edges[key] for key in sorted(self._rejected)]
+
+    @property
+    def doubt(self) -> str | None:
+        """What to say of a vote that left out more than half of the closures."""
+        return doubt_about(len(self._rejected), len(self._loops))
 
     def pose(self, vertex: int) -> Array:
         """Return the current (4, 4) T_map_vertex."""
@@ -131,7 +136,7 @@ class PoseGraph:
         Args:
             poses: (4, 4) T_map_vertex.
             edges: by key, rejected ones among them.
-            rejected: keys of the loop closures that are set aside.
+            rejected: keys of the loop closures that are rejected.
             solved: the poses are the optimum of the others; else closures have yet to be accepted.
             fixed: vertices that keep their poses.
             priors: of vertices; trusted as odometry is.
@@ -479,7 +484,7 @@ class PoseGraph:
     def _gauges(self) -> list[int]:
         """Return the fixed vertices, and of each part without any or a prior what else holds it.
 
-        That is the oldest root, or the oldest vertex where closures set aside have cut the part off.
+        That is the oldest root, or the oldest vertex where rejected closures have cut the part off.
         """
         if len(self._roots) == 1 and not self._parted:
             return self._roots

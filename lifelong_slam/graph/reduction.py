@@ -28,7 +28,7 @@ class State:
         edges: in use.
         loops: those of them that are loop closures.
         composed: those of them that are made of several measurements, closures among them.
-        rejected: loop closures and composed edges that are outvoted.
+        rejected: loop closures and composed edges that are rejected.
         chi_square: sum of squared Mahalanobis distances of the edges in use.
         seconds: wall time that it took to come here from the state before.
     """
@@ -96,7 +96,8 @@ def reduce(
     graph = loaded(replace(snapshot, poses=best_start(snapshot)), robust)
     graph.optimise(reconsider=True)
     optimum = watch.state(graph, [])
-    _warn_of_a_lost_vote(optimum)
+    if robust and (doubt := graph.doubt):
+        logger.warning("warning: %s (robust=false trusts them all)", doubt)
     left = max(round(keep * len(graph)), 1)
     logger.info("Optimised in %.1f s; down to %d vertices ...", optimum.seconds, left)
     removals = pruning.reduce(graph, left)
@@ -105,19 +106,6 @@ def reduce(
     return Reduction(
         read, optimum, pruned, graph.snapshot(), complete=graph.edge_count == len(graph.edges)
     )
-
-
-def _warn_of_a_lost_vote(state: State) -> None:
-    """Say that more than half of the closures are out: perhaps it isn't they that are wrong."""
-    every = state.loops + state.composed + state.rejected
-    if 2 * state.rejected > every:
-        logger.warning(
-            "warning: %d of %d loop closures are outvoted%s; if most of them are true, odometry is less"
-            " sure than it claims to be (robust=false trusts them all)",
-            state.rejected,
-            every,
-            ", and only odometry is left" if state.rejected == every else "",
-        )
 
 
 def loaded(snapshot: GraphSnapshot, robust: bool = True) -> PoseGraph:

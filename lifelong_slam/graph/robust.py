@@ -91,6 +91,17 @@ def objective(
     return value
 
 
+def doubt_about(rejected: int, every: int) -> str | None:
+    """Return what to say if more than half of all closures are rejected; perhaps it isn't they that err."""
+    if 2 * rejected <= every:
+        return None
+    alone = ", and only odometry is left" if rejected == every else ""
+    return (
+        f"{rejected} of {every} loop closures are rejected{alone}; if most of them are true, odometry"
+        " is less sure than it claims to be"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Choice:
     """A choice of closures at its optimum.

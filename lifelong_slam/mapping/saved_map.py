@@ -84,7 +84,7 @@ class MapUpdate:
         removed: vertices that leave the graph, in this order; their clouds and submaps go.
         edges: new or changed edges by id; ids are the graph's own.
         removed_edges: their ids.
-        rejected: ids of all loop closures that are outvoted now, or None if these are as before.
+        rejected: ids of all loop closures that are rejected now, or None if these are as before.
         scans: new ones.
         settled: vertices whose points are in a submap from now on; their points go.
         submaps: new or changed arrays of voxels by owner.
@@ -117,7 +117,7 @@ class SavedMap:
         keyframes: vertices of the graph by id; those settled have no points.
         poses: T_map_vertex (4, 4) by vertex.
         edges: by id, rejected ones among them.
-        rejected: ids of edges that are outvoted.
+        rejected: ids of edges that are rejected.
         removals: of all other keyframes ever taken, in the order in which they were made.
         scans: every scan ever taken, in the order of writing.
         submaps: arrays of voxels by owner.
