@@ -2,6 +2,7 @@
 
     python benchmarks/robustness.py --data $GRAPHS --out outputs/robustness
     python benchmarks/robustness.py --windows 0-300,500-800 --shares 10,30 --seeds 1,2 --sigmas 0.333
+    python benchmarks/robustness.py --files kitti_05_alpha_0.25.g2o:kitti_05_GT.g2o,...
 
 Windows of successive vertices are cut out of a graph whose closures are true, and closures that claim two
 random vertices to be in one place are added, as sure of themselves as a true one, as a share of all
@@ -13,7 +14,8 @@ closures. Each graph is solved from the poses in its file by
 - ours: the vote of `lifelong_slam/graph/robust.py`.
 
 The bar is the error with the true closures alone (APE: RMSE after alignment). `--sigmas 0.333` states
-standard deviations of odometry a third as large as the file does. Seconds are CPU time of one process.
+standard deviations of odometry a third as large as the file does. With `--files`, pairs of graph and
+truth, graphs are solved as they are, in place of windows. Seconds are CPU time of one process.
 """
 
 import argparse
@@ -53,6 +55,7 @@ WINDOWS = (
 )
 SHARES = (2.0, 5.0, 10.0, 20.0, 30.0)
 METHODS = ("odometry", "least squares", "GNC", "ours")
+FACTORS = (1.3, 1.5)
 T = TypeVar("T")
 _MATCH_SIGMA = 0.5  # m, of the place that a wrong closure claims
 
@@ -88,10 +91,44 @@ class Row:
     seconds: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True)
+class FileRow:
+    """One graph from a file.
+
+    Attributes:
+        name: of the file.
+        closures: in it.
+        accepted: closures that were let in, by method.
+        ape: metres, by method.
+        objective: of the vote, by method.
+        seconds: CPU time by method.
+    """
+
+    name: str
+    closures: int
+    accepted: dict[str, int]
+    ape: dict[str, float]
+    objective: dict[str, float]
+    seconds: dict[str, float]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables and write them, the rows and a plot."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parser().parse_args(arguments)
+    files = []
+    for graph, truth in options.files:
+        files.append(measure_file(graph, truth))
+        print(f"{graph.stem}: done", file=sys.stderr, flush=True)
+    rows = [] if options.files else measure_windows(options)
+    print(report(arguments, rows, files))
+    if options.out:
+        write(options.out, arguments, rows, files)
+    return 0
+
+
+def measure_windows(options: argparse.Namespace) -> list[Row]:
+    """Solve all windows with all shares of wrong closures and all seeds."""
     graph = read_g2o(options.data / f"{options.graph}.g2o")
     truth = read_truth(options.data / f"{options.graph}_groundtruth.txt", graph.poses)
     rows: list[Row] = []
@@ -99,10 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         clean = cut(graph, window, options.sigmas)
         rows.append(measure(clean, truth, window, share, seed))
         print(one_line(rows[-1]), file=sys.stderr, flush=True)
-    print(report(arguments, rows))
-    if options.out:
-        write(options.out, arguments, rows)
-    return 0
+    return rows
 
 
 def parser() -> argparse.ArgumentParser:
@@ -117,11 +151,17 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--shares", type=_list(float), default=SHARES)
     top.add_argument("--seeds", type=_list(int), default=(1, 2, 3, 4, 5))
     top.add_argument("--sigmas", type=float, default=1.0)
+    top.add_argument("--files", type=_list(_pair), default=[])
     return top
 
 
 def _list(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
     return lambda text: [kind(part) for part in text.split(",")]
+
+
+def _pair(text: str) -> tuple[Path, Path]:
+    graph, _, truth = text.partition(":")
+    return Path(graph), Path(truth)
 
 
 def cut(graph: GraphSnapshot, window: str, sigmas: float) -> GraphSnapshot:
@@ -141,38 +181,82 @@ def measure(
     clean: GraphSnapshot, truth: Mapping[int, Array], window: str, share: float, seed: int
 ) -> Row:
     """Solve a graph with wrong closures by all methods."""
-    true = [edge for edge in clean.edges if edge.kind != "odometry"]
+    odometry, true = by_kind(clean)
     wrong = list(wrong_closures(clean, true[0], round(len(true) * share / (100 - share)), seed))
-    odometry = [edge for edge in clean.edges if edge.kind == "odometry"]
-    graph = replace(clean, edges=[*odometry, *true, *wrong])
-    count = len(true) + len(wrong)
-    chosen: dict[str, set[int]] = {"odometry": set(), "least squares": set(range(count))}
-    seconds = {}
-    for name, method in (("GNC", by_gnc), ("ours", by_vote)):
-        start = time.process_time()
-        chosen[name] = method(graph, len(odometry))
-        seconds[name] = time.process_time() - start
-    chosen["true"] = set(range(len(true)))
-    ape, objective = {}, {}
-    for name, accepted in chosen.items():
-        closures = [*true, *wrong]
-        objective[name] = vote_objective(graph, odometry, closures, accepted)
-        poses = optimum(graph, odometry, [closures[k] for k in sorted(accepted)])
-        ape[name] = rmse(vertex_distances(poses, truth, poses, graph.planar))
-    bar = ape.pop("true")
+    closures = [*true, *wrong]
+    chosen, seconds = choices(clean, odometry, closures)
+    right = set(range(len(true)))
+    ape = {name: error(clean, odometry, closures, chosen[name], truth) for name in METHODS}
+    goals = {
+        name: vote_objective(clean, odometry, closures, accepted)
+        for name, accepted in (*chosen.items(), ("true", right))
+    }
     return Row(
         window,
         share,
         seed,
-        count,
+        len(closures),
         len(wrong),
-        bar,
+        error(clean, odometry, closures, right, truth),
         ape,
-        {name: len(chosen[name] - chosen["true"]) for name in ape},
-        {name: len(chosen["true"] - chosen[name]) for name in ape},
-        objective,
+        {name: len(chosen[name] - right) for name in ape},
+        {name: len(right - chosen[name]) for name in ape},
+        goals,
         seconds,
     )
+
+
+def measure_file(graph: Path, truth: Path) -> FileRow:
+    """Solve a graph from a file, whatever its closures are, by all methods."""
+    whole = read_g2o(graph)
+    poses = read_truth(truth, whole.poses)
+    odometry, closures = by_kind(whole)
+    chosen, seconds = choices(whole, odometry, closures)
+    ape = {name: error(whole, odometry, closures, chosen[name], poses) for name in METHODS}
+    goals = {name: vote_objective(whole, odometry, closures, chosen[name]) for name in METHODS}
+    return FileRow(
+        graph.stem,
+        len(closures),
+        {name: len(chosen[name]) for name in METHODS},
+        ape,
+        goals,
+        seconds,
+    )
+
+
+def by_kind(graph: GraphSnapshot) -> tuple[list[Edge], list[Edge]]:
+    """Return odometry, and the other edges."""
+    odometry = [edge for edge in graph.edges if edge.kind == "odometry"]
+    return odometry, [edge for edge in graph.edges if edge.kind != "odometry"]
+
+
+def choices(
+    graph: GraphSnapshot, odometry: Sequence[Edge], closures: Sequence[Edge]
+) -> tuple[dict[str, set[int]], dict[str, float]]:
+    """Return the closures that each method lets in, by index, and the CPU time of those that choose."""
+    whole = replace(graph, edges=[*odometry, *closures])
+    chosen: dict[str, set[int]] = {"odometry": set(), "least squares": set(range(len(closures)))}
+    seconds = {}
+    for name, method in (("GNC", by_gnc), ("ours", by_vote)):
+        start = time.process_time()
+        chosen[name] = method(whole, len(odometry))
+        seconds[name] = time.process_time() - start
+    return chosen, seconds
+
+
+def error(
+    graph: GraphSnapshot,
+    odometry: Sequence[Edge],
+    closures: Sequence[Edge],
+    accepted: set[int],
+    truth: Mapping[int, Array],
+) -> float:
+    """Return the APE in metres with some closures, by index, at the best optimum from several starts."""
+    used = [closures[k] for k in sorted(accepted)]
+    trusting = loaded(replace(graph, edges=[*odometry, *used]), robust=False)
+    trusting.optimise()
+    poses = trusting.poses()
+    return rmse(vertex_distances(poses, truth, poses, graph.planar))
 
 
 def wrong_closures(graph: GraphSnapshot, like: Edge, count: int, seed: int) -> Iterator[Edge]:
@@ -226,15 +310,6 @@ def pose2(T: Array) -> gtsam.Pose2:
     return gtsam.Pose2(T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
 
 
-def optimum(
-    graph: GraphSnapshot, odometry: Sequence[Edge], accepted: Sequence[Edge]
-) -> dict[int, Array]:
-    """Return the poses with some closures, the best from several starts."""
-    trusting = loaded(replace(graph, edges=[*odometry, *accepted]), robust=False)
-    trusting.optimise()
-    return trusting.poses()
-
-
 def vote_objective(
     graph: GraphSnapshot, odometry: Sequence[Edge], closures: Sequence[Edge], accepted: set[int]
 ) -> float:
@@ -255,24 +330,23 @@ def one_line(row: Row) -> str:
     )
 
 
-def report(arguments: Sequence[str], rows: Sequence[Row]) -> str:
-    """Return the table over shares as Markdown."""
+def report(arguments: Sequence[str], rows: Sequence[Row], files: Sequence[FileRow]) -> str:
+    """Return the tables as Markdown."""
+    tables = ([by_share(rows)] if rows else []) + ([by_file(files)] if files else [])
+    return "\n\n".join([facts("robustness.py", arguments), *tables])
+
+
+def by_share(rows: Sequence[Row]) -> str:
+    """Return the table of windows over the shares of wrong closures."""
     header = ["wrong %", "graphs"]
-    header += [
-        f"{name}: within {factor} of the bar" for name in METHODS[1:] for factor in (1.3, 1.5)
-    ]
-    header += [
-        "ours: worse than odometry",
-        "ours: worse objective than GNC",
-        "GNC s",
-        "ours s",
-        "ours s at most",
-    ]
+    header += [f"{name}: within {factor} of the bar" for name in METHODS[1:] for factor in FACTORS]
+    header += ["ours: worse than odometry", "ours: worse objective than GNC"]
+    header += ["GNC s", "ours s", "ours s at most"]
     lines = []
     for share in sorted({row.share for row in rows}):
         group = [row for row in rows if row.share == share]
         line = [f"{share:g}", str(len(group))]
-        for name, factor in product(METHODS[1:], (1.3, 1.5)):
+        for name, factor in product(METHODS[1:], FACTORS):
             within = np.mean([row.ape[name] <= factor * row.bar for row in group])
             line.append(f"{100 * within:.0f} %")
         line.append(str(sum(row.ape["ours"] > row.ape["odometry"] for row in group)))
@@ -280,19 +354,45 @@ def report(arguments: Sequence[str], rows: Sequence[Row]) -> str:
         line += [f"{np.mean([row.seconds[name] for row in group]):.2f}" for name in ("GNC", "ours")]
         line.append(f"{max(row.seconds['ours'] for row in group):.2f}")
         lines.append(line)
-    return "\n\n".join([facts("robustness.py", arguments), markdown(header, lines)])
+    return markdown(header, lines)
 
 
-def write(folder: Path, arguments: Sequence[str], rows: Sequence[Row]) -> None:
+def by_file(files: Sequence[FileRow]) -> str:
+    """Return the table of graphs from files."""
+    header = ["graph", "closures", "GNC: in", "ours: in"]
+    header += [f"APE {name}" for name in METHODS]
+    header += ["objective GNC", "objective ours", "GNC s", "ours s"]
+    lines = [
+        [
+            row.name,
+            str(row.closures),
+            *(str(row.accepted[name]) for name in METHODS[2:]),
+            *(f"{row.ape[name]:.3f}" for name in METHODS),
+            *(f"{row.objective[name]:.1f}" for name in METHODS[2:]),
+            *(f"{row.seconds[name]:.2f}" for name in METHODS[2:]),
+        ]
+        for row in files
+    ]
+    return markdown(header, lines)
+
+
+def write(
+    folder: Path, arguments: Sequence[str], rows: Sequence[Row], files: Sequence[FileRow]
+) -> None:
     """Write the report, the rows and the plot."""
     with atomic_path(folder / "robustness.md") as path:
-        path.write_text(report(arguments, rows) + "\n")
+        path.write_text(report(arguments, rows, files) + "\n")
     write_json(
         folder / "robustness.json",
-        {"run": describe_run(arguments, seed=0), "graphs": [asdict(row) for row in rows]},
+        {
+            "run": describe_run(arguments, seed=0),
+            "windows": [asdict(row) for row in rows],
+            "files": [asdict(row) for row in files],
+        },
     )
-    with atomic_path(folder / "robustness.png") as path:
-        plot(rows, path)
+    if rows:
+        with atomic_path(folder / "robustness.png") as path:
+            plot(rows, path)
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:

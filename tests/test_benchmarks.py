@@ -11,12 +11,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from g2o_support import laps as laps_in_file
 from run_support import START, ListSource, arc, write_folder
 
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.geometry import exp
 from lifelong_slam.graph.marginalisation import StarMesh
 from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.io.g2o import write_g2o
 from lifelong_slam.result import Edge, GraphSnapshot, SlamResult
 from lifelong_slam.trajectory import Trajectory
 
@@ -310,3 +312,25 @@ def test_factor_recovery_prints_a_row_for_each_method(capsys, monkeypatch):
     methods = [row[2] for row in rows if len(row) == 8]
     assert methods
     assert set(methods) == {"mesh", "recovered", "tree"}
+
+
+def test_robustness_tells_true_closures_from_wrong_ones(tmp_path, capsys):
+    robustness = importlib.import_module("robustness")
+    graph, truth = laps_in_file(planar=True, seed=1)
+    write_g2o(tmp_path / "laps.g2o", graph)
+    write_g2o(tmp_path / "laps_groundtruth.txt", GraphSnapshot(truth, [], planar=True))
+    out = tmp_path / "out"
+    ends = ["--data", str(tmp_path), "--graph", "laps", "--out", str(out)]
+    assert robustness.main([*ends, "--windows", "0-40,0-60", "--shares", "20", "--seeds", "1"]) == 0
+    rows = json.loads((out / "robustness.json").read_text())["windows"]
+    assert [row["wrong"] for row in rows] == [5, 10]
+    for row in rows:
+        assert row["accepted"]["ours"] == row["left_out"]["ours"] == 0
+        assert row["ape"]["ours"] == pytest.approx(row["bar"])
+        assert row["ape"]["least squares"] > 2 * row["bar"]
+        assert row["objective"]["ours"] <= row["objective"]["GNC"] + 1e-2
+    assert "| 20" in capsys.readouterr().out
+    assert (out / "robustness.png").stat().st_size > 10_000
+    pair = f"{tmp_path / 'laps.g2o'}:{tmp_path / 'laps_groundtruth.txt'}"
+    assert robustness.main(["--files", pair]) == 0
+    assert "| laps" in capsys.readouterr().out
