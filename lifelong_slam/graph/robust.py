@@ -59,7 +59,7 @@ _TRIALS = 3  # steps of a kind at most that are tried before a choice counts as 
 _RIVALS = 1  # groups at most that are held against the best choice
 _ALLIES = 3  # closures that make such a group; two agree by chance
 _LEAST_GAIN = 1e-3  # in the objective; less is rounding
-_FEW = 64  # closures that are looked at exactly at once
+_FEW = 128  # closures that are looked at exactly at once
 _ROUGHLY = 1.3  # by which a sampled covariance may be off
 _LEFT_OPEN = (
     0.05  # share of a closure's variance that is supposed to be left open, where samples tell
@@ -134,12 +134,12 @@ def vote(problem: ClosureProblem, starts: Iterable[Start]) -> Choice:
     """
     search = _Search(problem)
     begun = [search.glance(frozenset(accepted), values) for accepted, values in starts]
-    best = search.descend(next(filter(search.is_perfect, begun), begun[0]))
-    if search.is_perfect(best):
-        return best
-    for choice in begun:
-        if choice.objective < best.objective:
-            best = search.descend(choice)
+    best = begun[0]
+    for choice in sorted(begun, key=search.is_perfect, reverse=True):
+        if choice is begun[0] or choice.objective < best.objective or search.is_perfect(choice):
+            best = min(best, search.descend(choice), key=lambda found: found.objective)
+        if search.is_perfect(best):
+            return best
     if len(begun) > 1:
         best = search.relaxed(best)
     return search.rivalled(best)
@@ -280,19 +280,21 @@ class _Search:
     ) -> "_Flips":
         """Return those closures that make the objective fall when added (1) or dropped (-1).
 
-        Covariances are estimated from random draws first. They are exact where that leaves few to look
-        at, and for what is to be dropped, since what the others leave open is a small difference.
+        Where there are many, covariances are estimated from random draws first. What is to be added needs
+        no more, as it is verified; what is to be dropped is judged by the small share of its variance that
+        the others leave open, so that draws only tell which to look at exactly.
         """
         closures = self._all[asked]
-        if len(closures) > _FEW:
-            r, spread = around.residuals[closures], around.sampled_spread[asked]
-            change, doubt = _change(r, spread, sign)
-            if sign < 0:
-                change = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)[0]
-            flips = self._falling(choice, closures, change, doubt, sign)
-            if sign > 0 and len(flips.closures) > _FEW:
+        r, spread = around.residuals[closures], around.sampled_spread[asked]
+        if sign > 0 and len(closures) > _FEW:
+            flips = self._falling(choice, closures, *_change(r, spread, sign), sign)
+            if len(flips.closures) > _FEW:
                 return flips
-            closures = flips.closures[np.argsort(flips.objective)][:_FEW]
+            near = _change(r, _ROUGHLY * spread, sign)[0]
+            closures = closures[np.argsort(near, kind="stable")[:_FEW]]
+        elif len(closures) > _FEW:
+            fall = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)[0]
+            closures = closures[np.argsort(fall, kind="stable")[:_FEW]]
         if not len(closures):
             return _Flips(closures, np.zeros(0), np.zeros(0))
         change, doubt = _change(around.residuals[closures], around.spread(closures), sign)
