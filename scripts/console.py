@@ -128,8 +128,11 @@ def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, s
     elif "position_error" in trajectory["reasons"]:
         yield "Trajectory error", trajectory["reasons"]["position_error"]
     if "vertices" in graph:
-        loops = graph["loop_edges"]
-        yield "Pose graph", f"{graph['vertices']} vertices, {graph['edges']} edges, {loops} loops"
+        yield (
+            "Pose graph",
+            f"{graph['vertices']} vertices, {graph['edges']} edges: {graph['loop_edges']} loop closures,"
+            f" {graph['composed_edges']} composed of several measurements",
+        )
     if "points" in points:
         yield "Map", f"{points['points']:,} points"
     if points.get("mean_distance_m") is not None:
