@@ -315,7 +315,7 @@ def vote_objective(
 ) -> float:
     """Return what the vote would call a choice of closures, by index: the best from several starts."""
     trusted = Trusted(odometry, [min(graph.poses)])
-    problem = ClosureProblem(graph.poses, trusted, dict(enumerate(closures)), graph.planar)
+    problem = ClosureProblem(graph.poses, trusted, closures, graph.planar)
     starts = [problem.values(graph.poses), problem.chained(graph.poses)]
     return fitted(problem, [(accepted, start) for start in starts]).objective
 

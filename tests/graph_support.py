@@ -67,3 +67,31 @@ def disagreement(e, poses):
     model = gtsam.noiseModel.Gaussian.Covariance(e.covariance)
     measured = gtsam.Pose3(e.T_source_target)
     return 2 * gtsam.BetweenFactorPose3(e.source, e.target, measured, model).error(values)
+
+
+def gtsam_graph(edges):
+    """Return GTSAM's factors for edges, the first vertex held at the origin."""
+    graph = gtsam.NonlinearFactorGraph()
+    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.push_back(gtsam.PriorFactorPose3(0, gtsam.Pose3(), held))
+    for e in edges:
+        noise = gtsam.noiseModel.Gaussian.Covariance(e.covariance)
+        motion = gtsam.Pose3(e.T_source_target)
+        graph.push_back(gtsam.BetweenFactorPose3(e.source, e.target, motion, noise))
+    return graph
+
+
+def chained(odometry):
+    """Return the poses (4, 4) by vertex that odometry from the origin leads to."""
+    poses = {0: np.eye(4)}
+    for e in odometry:
+        poses[e.target] = poses[e.source] @ e.T_source_target
+    return poses
+
+
+def gtsam_values(poses):
+    """Return poses (4, 4) by vertex as GTSAM's values."""
+    values = gtsam.Values()
+    for vertex, T in poses.items():
+        values.insert(vertex, gtsam.Pose3(T))
+    return values

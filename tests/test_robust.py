@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
-from graph_support import closure, edge, laps
+from graph_support import chained, closure, edge, gtsam_graph, gtsam_values, laps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
@@ -58,11 +58,9 @@ def test_composed_edges_leave_the_scale_alone():
     assert value(5.0, 100, 3, scaled=False) == pytest.approx(5.0 + 3 * threshold(3))
 
 
-def problem_of(odometry, closures, planar_graph=False):
-    poses = {0: np.eye(4)}
-    for e in odometry:
-        poses[e.target] = poses[e.source] @ e.T_source_target
-    problem = ClosureProblem(poses, Trusted(odometry, [0]), dict(enumerate(closures)), planar_graph)
+def problem_of(odometry, closures):
+    poses = chained(odometry)
+    problem = ClosureProblem(poses, Trusted(odometry, [0]), closures, planar=False)
     return problem, problem.chained(poses)
 
 
@@ -161,27 +159,16 @@ def test_it_never_ends_worse_than_odometry_alone_what_was_in_use_or_gnc(seed):
     problem, start = problem_of(odometry, closures)
     before = [k for k in range(len(closures)) if rng.random() < 0.5]
     choice = vote(problem, [((), start), (before, start)])
-    rivals = [(), before, by_gnc(odometry, closures, problem)]
+    rivals = [(), before, by_gnc(odometry, closures)]
     for accepted in rivals:
         rival = fitted(problem, [(accepted, start), (accepted, choice.values)])
         assert choice.objective <= rival.objective + 1e-3
 
 
-def by_gnc(odometry, closures, problem):
+def by_gnc(odometry, closures):
     """Return the closures that GTSAM's graduated non-convexity lets in."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.push_back(
-        gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
-    )
-    for e in [*odometry, *closures]:
-        noise = gtsam.noiseModel.Gaussian.Covariance(e.covariance)
-        motion = gtsam.Pose3(e.T_source_target)
-        graph.push_back(gtsam.BetweenFactorPose3(e.source, e.target, motion, noise))
-    T = gtsam.Pose3()
-    values.insert(0, T)
-    for e in odometry:
-        T = T.compose(gtsam.Pose3(e.T_source_target))
-        values.insert(e.target, T)
+    graph = gtsam_graph([*odometry, *closures])
+    values = gtsam_values(chained(odometry))
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers(list(range(len(odometry) + 1)))

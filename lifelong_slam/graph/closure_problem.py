@@ -52,7 +52,6 @@ class ClosureProblem:
     """Trusted edges, and closures that may be taken or left.
 
     Attributes:
-        closures: keys of the closures, in the order of all arrays over closures.
         dof: degrees of freedom of a vertex, 3 or 6.
         measured: every closure is one measurement, none is composed of several.
     """
@@ -61,7 +60,7 @@ class ClosureProblem:
         self,
         poses: Mapping[int, Array],
         trusted: Trusted,
-        closures: Mapping[int, Edge],
+        closures: Sequence[Edge],
         planar: bool,
     ) -> None:
         """Condense.
@@ -70,23 +69,22 @@ class ClosureProblem:
             poses: (4, 4) T_map_vertex; only those of anchors, and of parts that closures alone tie to
                 the rest, matter to the outcome.
             trusted: what is taken for granted.
-            closures: by key.
+            closures: in the order of all arrays over closures.
             planar: all poses lie in a plane, and only what lies in it is measured.
         """
-        self.closures = list(closures)
         self.dof = 3 if planar else 6
-        self.measured = all(edge.kind == "loop" for edge in closures.values())
+        self.measured = all(edge.kind == "loop" for edge in closures)
         self._planar = planar and not trusted.factors
         self._width = 3 if self._planar else 6
-        self._closures = list(closures.values())
-        self._ends = [(edge.source, edge.target) for edge in closures.values()]
+        self._closures = closures
+        self._ends = [(edge.source, edge.target) for edge in closures]
         needed = {vertex for ends in self._ends for vertex in ends} | set(trusted.anchors)
         needed |= {vertex for factor in trusted.factors for vertex in factor.keys()}  # noqa: SIM118
         self._chains = _condense(trusted.edges, needed)
         self._links = [
             way.link for way in self._chains if way.link and way.source != way.link.target
         ]
-        self._factors = [self._between(edge) for edge in closures.values()]
+        self._factors = [self._between(edge) for edge in closures]
         self._trusted = gtsam.NonlinearFactorGraph()
         for factor in [*map(self._between, self._links), *trusted.factors]:
             self._trusted.push_back(factor)
@@ -95,7 +93,7 @@ class ClosureProblem:
         self._hold(poses, trusted)
 
     def __len__(self) -> int:
-        return len(self.closures)
+        return len(self._closures)
 
     def values(self, poses: Mapping[int, Array]) -> gtsam.Values:
         """Return the given poses of the vertices that are left."""
@@ -176,10 +174,6 @@ class ClosureProblem:
         optimiser = gtsam.LevenbergMarquardtOptimizer(self._graph(accepted), start, params)
         values = optimiser.optimize()
         return values, 2 * float(optimiser.error())
-
-    def chi_squares(self, values: gtsam.Values) -> Array:
-        """Return each closure's own squared Mahalanobis distance."""
-        return np.array([2 * factor.error(values) for factor in self._factors])
 
     def linearise(self, accepted: Iterable[int], values: gtsam.Values) -> "Linearised":
         """Return what small changes of the choice of closures would do at an optimum."""
@@ -266,7 +260,8 @@ class Linearised:
         self.residuals = b
         self._A, self._J = A, J
         self._columns = columns
-        self._lu = splu(
+        # Where all vertices are held there is nothing to solve for.
+        self._lu = J.shape[1] and splu(
             scipy.sparse.csc_matrix(J.T @ J),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
@@ -277,7 +272,7 @@ class Linearised:
     def sampled_spread(self) -> Array:
         """(K, d, d) covariances of all predictions, estimated from random draws: a quick look."""
         noise = np.random.default_rng(0).normal(size=(self._J.shape[0], _DRAWS))
-        draws = self._predictions(np.arange(len(self._A)), self._lu.solve(self._J.T @ noise))
+        draws = self._predictions(np.arange(len(self._A)), self._solve(self._J.T @ noise))
         spread: Array = draws @ np.swapaxes(draws, 1, 2) / _DRAWS
         return spread
 
@@ -287,7 +282,7 @@ class Linearised:
         right = np.zeros((self._J.shape[1] + 1, n, d))
         for i, k in enumerate(closures):
             right[self._columns[k], i] = self._A[k].T
-        solved = self._lu.solve(right[:-1].reshape(-1, n * d))
+        solved = self._solve(right[:-1].reshape(-1, n * d))
         return self._predictions(closures, solved).reshape(n, d, n, d).swapaxes(1, 2)
 
     def spread(self, closures: NDArray[np.int64]) -> Array:
@@ -295,6 +290,11 @@ class Linearised:
         joint = self.joint_spread(closures)
         own: Array = joint[np.arange(len(joint)), np.arange(len(joint))]
         return own
+
+    def _solve(self, right: Array) -> Array:
+        """Return the (C, m) solutions for (C, m) right-hand sides."""
+        solution: Array = self._lu.solve(right) if self._lu else right
+        return solution
 
     def _predictions(self, closures: NDArray[np.int64], changes: Array) -> Array:
         """Return (n, d, m) whitened changes of closures' predictions with (C, m) changes of the poses."""

@@ -437,7 +437,7 @@ class PoseGraph:
                 self._roots,
                 [factor for key, factor in self._factors.items() if key not in self._edges],
             ),
-            {key: self._edges[key] for key in keys},
+            [self._edges[key] for key in keys],
             self._planar,
         )
         now = problem.values(poses)

@@ -32,7 +32,6 @@ of its prediction by all that is in use. Steps are
 Each step is verified by a nonlinear optimisation, and undone where the objective doesn't fall.
 """
 
-import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -45,7 +44,6 @@ from scipy.stats import chi2
 from lifelong_slam.graph.closure_problem import ClosureProblem, Linearised
 
 Array = NDArray[np.float64]
-logger = logging.getLogger(__name__)
 
 INLIER_PROBABILITY = 0.999  # share of true closures that cost less than the threshold
 MOST_SCALE = 3.0  # by which stated standard deviations are believed to be off, either way
@@ -61,9 +59,7 @@ _ALLIES = 3  # closures that make such a group; two agree by chance
 _LEAST_GAIN = 1e-3  # in the objective; less is rounding
 _FEW = 128  # closures that are looked at exactly at once
 _ROUGHLY = 1.3  # by which a sampled covariance may be off
-_LEFT_OPEN = (
-    0.05  # share of a closure's variance that is supposed to be left open, where samples tell
-)
+_LEFT_OPEN = 0.01  # share of a closure's variance that draws can tell to be left open
 _HELD = 1e-9  # share of a closure's variance that the others leave open at least
 
 
@@ -285,16 +281,13 @@ class _Search:
         the others leave open, so that draws only tell which to look at exactly.
         """
         closures = self._all[asked]
-        r, spread = around.residuals[closures], around.sampled_spread[asked]
-        if sign > 0 and len(closures) > _FEW:
+        if len(closures) > _FEW:
+            r, spread = around.residuals[closures], around.sampled_spread[closures]
             flips = self._falling(choice, closures, *_change(r, spread, sign), sign)
-            if len(flips.closures) > _FEW:
+            if sign > 0 and len(flips.closures) > _FEW:
                 return flips
-            near = _change(r, _ROUGHLY * spread, sign)[0]
-            closures = closures[np.argsort(near, kind="stable")[:_FEW]]
-        elif len(closures) > _FEW:
-            fall = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)[0]
-            closures = closures[np.argsort(fall, kind="stable")[:_FEW]]
+            change, _ = _change(r, _ROUGHLY * spread, sign, least=_LEFT_OPEN)
+            closures = closures[np.argsort(change, kind="stable")[:_FEW]]
         if not len(closures):
             return _Flips(closures, np.zeros(0), np.zeros(0))
         change, doubt = _change(around.residuals[closures], around.spread(closures), sign)
