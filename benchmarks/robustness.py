@@ -396,7 +396,7 @@ def write(
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """Draw the error over the share of wrong closures, as a multiple of the bar; a dot a graph."""
+    """Draw the error over the share of wrong closures, in multiples of the bar: dots and their median."""
     figure, axes = plt.subplots(figsize=(8, 4.5), layout="constrained")
     shares = sorted({row.share for row in rows})
     for k, name in enumerate(METHODS):
@@ -418,7 +418,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
         xlabel="wrong closures, of all",
         ylabel="APE, in multiples of the bar",
     )
-    axes.legend()
+    figure.legend(loc="outside upper center", ncols=5)
     figure.savefig(path, dpi=150, format="png")
     plt.close(figure)
 
