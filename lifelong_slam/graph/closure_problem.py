@@ -13,12 +13,11 @@ import gtsam
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from lifelong_slam.geometry import exp, invert, log
 from lifelong_slam.graph.edges import chain, outward, reverse
-from lifelong_slam.graph.initialisation import chordal
+from lifelong_slam.graph.initialisation import chordal, components
 from lifelong_slam.result import Edge, GraphSnapshot
 
 Array = NDArray[np.float64]
@@ -214,7 +213,7 @@ class ClosureProblem:
         ties = [(link.source, link.target) for link in self._links]
         ties += [(f.keys()[0], v) for f in trusted.factors for v in f.keys()[1:]]
         tied = {v for f in trusted.factors for v in f.keys()[:1] if len(f.keys()) == 1}
-        for part in _parts(self.vertices, ties):
+        for part in components(self.vertices, ties):
             if not part & (set(self._held) | tied):
                 vertex = min(part)
                 self._trusted.push_back(self._prior(vertex, poses[vertex], free))
@@ -361,20 +360,6 @@ def _follow(
         walked.add(id(onward[0]))
         link = chain(link, outward(onward[0], link.target))
     return _Chain(vertex, link, passed)
-
-
-def _parts(vertices: Iterable[int], ties: Iterable[tuple[int, int]]) -> list[set[int]]:
-    """Return the sets of vertices that ties connect."""
-    index = {vertex: k for k, vertex in enumerate(vertices)}
-    pairs = np.array([(index[a], index[b]) for a, b in ties]).reshape(-1, 2)
-    matrix = scipy.sparse.coo_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(index), len(index))
-    )
-    count, labels = connected_components(matrix, directed=False)
-    parts: list[set[int]] = [set() for _ in range(count)]
-    for vertex, label in zip(index, labels.tolist(), strict=True):
-        parts[label].add(vertex)
-    return parts
 
 
 def _pose2(T: Array) -> gtsam.Pose2:

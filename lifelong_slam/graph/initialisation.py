@@ -5,7 +5,7 @@ the best one. Rotations that are found first, by the chordal relaxation, which i
 (Carlone, Tron, Daniilidis and Dellaert, *Initialization techniques for 3D SLAM*, ICRA 2015).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import networkx
@@ -18,15 +18,20 @@ from lifelong_slam.result import Edge, GraphSnapshot, Prior
 Array = NDArray[np.float64]
 
 _LOOP_WEIGHT = 1e9  # more than there are odometry edges: closures come in only where odometry ends
-
 _WIDEST = 1e6  # variance in the chordal relaxation, relative to the least
 
 
-def connected(graph: GraphSnapshot) -> list[set[int]]:
-    """Return the sets of vertices that edges connect, by their lowest vertex."""
-    structure = networkx.Graph((edge.source, edge.target) for edge in graph.edges)
-    structure.add_nodes_from(graph.poses)
+def components(vertices: Iterable[int], ties: Iterable[tuple[int, int]]) -> list[set[int]]:
+    """Return the sets of vertices that ties connect, by their lowest vertex."""
+    structure: networkx.Graph[int] = networkx.Graph()
+    structure.add_nodes_from(vertices)
+    structure.add_edges_from(ties)
     return sorted(networkx.connected_components(structure), key=min)
+
+
+def connected(graph: GraphSnapshot) -> list[set[int]]:
+    """Return the sets of vertices that a graph's edges connect, by their lowest vertex."""
+    return components(graph.poses, ((edge.source, edge.target) for edge in graph.edges))
 
 
 def chained(edges: list[Edge]) -> dict[int, Array]:
