@@ -15,7 +15,7 @@ run: setup  ## Simulate a campaign and run SLAM on it; ARGS="scenario=A sensor=v
 	$(PYTHON_VENV) scripts/run.py $(ARGS)
 
 test: setup  ## Run all tests
-	$(PYTHON_VENV) -m pytest
+	$(PYTHON_VENV) -m pytest -n auto --dist loadfile
 
 test-fast: setup  ## Run the tests that take less than about five seconds
 	$(PYTHON_VENV) -m pytest -m "not slow"

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lifelong_slam.odometry.tracking import TrackingLog
 from lifelong_slam.trajectory import Trajectory
 
 EdgeKind = Literal["odometry", "loop", "composed"]
@@ -87,9 +88,13 @@ class SlamResult:
         map_points: (M, 3) float32, metres, static points in the map frame.
         graph: the final pose graph.
         counts: whatever the system counted, e.g. loop closures accepted and rejected by reason.
+        tracking: what the poses rest on, of a system that knows.
+        doubts: what the system itself says against its result, a sentence each.
     """
 
     trajectory: Trajectory
     map_points: NDArray[np.float32]
     graph: GraphSnapshot
     counts: dict[str, int] = field(default_factory=dict)
+    tracking: TrackingLog | None = None
+    doubts: tuple[str, ...] = ()

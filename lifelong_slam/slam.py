@@ -8,6 +8,7 @@ scan -> odometry -> keyframe -> pose graph <-> loop closures
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +27,8 @@ from lifelong_slam.mapping.session import MapSession
 from lifelong_slam.mapping.static_map import StaticMap, thin
 from lifelong_slam.mapping.track import Track
 from lifelong_slam.memory import kept
-from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate
+from lifelong_slam.odometry.odometry import Odometry, OdometryEstimate, Tracking
+from lifelong_slam.odometry.tracking import TrackingLog
 from lifelong_slam.result import Edge, GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 
@@ -78,6 +80,7 @@ class LifelongSlam:
         self._settle_every = settle_every
         self._graph = PoseGraph()
         self._track = Track()
+        self._tracking = TrackingLog()
         self._keyframes: dict[int, Keyframe] = {}  # those that are vertices
         self._window: list[int] = []
         self._removals = RemovalLog()
@@ -130,6 +133,7 @@ class LifelongSlam:
         """Take in one scan: odometry always, the graph and the map if it becomes a keyframe."""
         stages = _Stages()
         estimate = self._odometry.register(scan)
+        self._tracking.update(scan, estimate)
         self._track.add(estimate.stamp, estimate.T_odom_sensor)
         stages.end("odometry_ms")
         if self._selector.takes(estimate):
@@ -157,8 +161,6 @@ class LifelongSlam:
         for edge in self._loop_closer.look_back(self._keyframes, self._graph, count=None):
             self._graph.add_edge(edge)
         self._graph.optimise(reconsider=True)
-        if doubt := self._graph.doubt:
-            logger.warning("warning: %s", doubt)
         self._settle(len(self._window))
         self._save(self._track.scans_after_newest())
         poses = recover(self._graph.poses(), self._removals)
@@ -169,7 +171,10 @@ class LifelongSlam:
             if self._map_points is None
             else self._map_points,
             graph=graph,
+            tracking=self._tracking,
+            doubts=tuple(self._doubts()),
             counts={
+                **self._odometry.counts,
                 **self._loop_closer.counts,
                 "loop closures rejected": len(self._graph.rejected),
                 "keyframes": len(self._track.keyframes),
@@ -192,9 +197,12 @@ class LifelongSlam:
         return self._session.id if self._session else 0
 
     def _snapshot(self) -> GraphSnapshot:
-        """Return the graph without sessions that are in frames of their own."""
+        """Return the graph without other sessions that are in frames of their own."""
         own = [i for i in self._graph.vertices if self._keyframes[i].session == self._session_id]
-        connected = self._graph.component(own[-1] if own else self._graph.roots[0])
+        connected: set[int] = set()
+        for vertex in own or self._graph.roots[:1]:
+            if vertex not in connected:
+                connected |= self._graph.component(vertex)
         return GraphSnapshot(
             {i: T for i, T in self._graph.poses().items() if i in connected},
             [edge for edge in self._graph.edges if edge.source in connected],
@@ -202,6 +210,10 @@ class LifelongSlam:
 
     def _add_keyframe(self, estimate: OdometryEstimate) -> Keyframe:
         """Make a keyframe of the newest scan, and a vertex with its odometry."""
+        T_map_sensor = np.eye(4)
+        if estimate.tracking is Tracking.STARTED and self._window:
+            T_map_sensor = self._graph.pose(self._window[-1]) @ self._track.since_keyframe()
+            self._part()
         last = self._keyframes[self._window[-1]] if self._window else None
         keyframe = Keyframe(
             id=self._next_id,
@@ -216,9 +228,9 @@ class LifelongSlam:
         self._next_id += 1
         self._keyframes[keyframe.id] = keyframe
         self._window.append(keyframe.id)
-        self._track.mark_keyframe(keyframe.id)
+        self._track.mark_keyframe(keyframe.id, starts=last is None)
         if last is None:
-            self._graph.add_vertex(keyframe.id, np.eye(4))
+            self._graph.add_vertex(keyframe.id, T_map_sensor)
         else:
             motion = invert(last.T_odom_sensor) @ keyframe.T_odom_sensor
             covariance = relative_covariance(last, keyframe, motion)
@@ -226,6 +238,16 @@ class LifelongSlam:
             A = adjoint(invert(motion))
             self._drift = A @ self._drift @ A.T + covariance
         return keyframe
+
+    def _part(self) -> None:
+        """Settle all that was driven, as odometry doesn't lead from there to the newest scan.
+
+        What follows is a component of its own, which a loop closure may join to the others.
+        """
+        self._graph.optimise()
+        self._settle(len(self._window))
+        self._loop_closer.part()
+        self._drift = np.zeros((6, 6))
 
     def _close_loops(self, keyframe: Keyframe, estimate: OdometryEstimate) -> bool:
         """Look for loop closures; tell whether one is news to the graph."""
@@ -284,6 +306,12 @@ class LifelongSlam:
             submaps={i: self._static_map.submaps[i] for i in changed},
             places=self._loop_closer.places.take_new(),
         )
+
+    def _doubts(self) -> Iterator[str]:
+        if doubt := self._graph.doubt:
+            yield doubt
+        if self._session is not None and self._session.localize and not self._session.is_located:
+            yield "the session was not located in the map that it was to be localised in"
 
     def _end_session(self) -> dict[str, int]:
         """Mark the session in the map's file as done; return whether it is located in the map."""

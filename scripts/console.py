@@ -110,6 +110,9 @@ def show_results(record: "RunRecord", metrics: dict[str, Any], folder: Path) -> 
         table.add_row(name, value)
     Console().print(table)
     print(f"Run folder: {folder}")
+    verdict = metrics["run"]["verdict"]
+    if verdict["reasons"]:
+        print(f"This run is {verdict['status']}:", *verdict["reasons"], sep="\n  ", file=sys.stderr)
 
 
 def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -138,4 +141,5 @@ def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, s
     if points.get("mean_distance_m") is not None:
         mean = points["mean_distance_m"]["map_to_reference"]
         yield "Map error", f"{mean:.3f} m mean distance from the true surface"
+    yield "Verdict", metrics["run"]["verdict"]["status"]
     yield "Peak memory", f"{record.peak_rss_mb:.0f} MB"

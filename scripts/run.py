@@ -1,7 +1,8 @@
 """Run a SLAM system on a recording and leave a run folder: `python scripts/run.py --help`.
 
-Exit status: 0 done; 1 a bug; 2 bad input or settings, said in one line on stderr; 130 stopped by
-SIGINT or SIGTERM, with what was mapped until then written (unless it was aborted by a second one).
+Exit status: 0 done; 1 a bug; 2 bad input or settings, said in one line on stderr; 3 done and written, but
+the verdict on the run is that it is doubtful or lost, for reasons that are said; 130 stopped by SIGINT or
+SIGTERM, with what was mapped until then written (unless it was aborted by a second one).
 """
 
 import os
@@ -18,10 +19,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from command import BAD_INPUT, CONF, INTERRUPTED, KNOWN_ERRORS, plain
+from command import BAD_INPUT, CONF, DOUBTFUL, INTERRUPTED, KNOWN_ERRORS, plain
 from console import fail, scan_progress, show_results
 from eval.evaluation import make_settings
 from eval.run import evaluate_run
+from lifelong_slam.assessment import Status, assess
 from lifelong_slam.config import build, check_value
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.mapping.session import MapSession
@@ -55,6 +57,14 @@ def job(config: DictConfig) -> None:
     if record.interrupted:
         print("Stopped early: the run folder holds what was mapped until then.", file=sys.stderr)
         raise SystemExit(INTERRUPTED)
+    if assess(record).status is not Status.GOOD:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise DoubtfulRunError(folder)  # as above
+        raise SystemExit(DOUBTFUL)
+
+
+class DoubtfulRunError(Exception):
+    """A run of a sweep that was written, but whose verdict isn't that it is good."""
 
 
 def slam(config: DictConfig, folder: Path) -> RunRecord:
@@ -113,6 +123,7 @@ def map_session(config: DictConfig, system: System, source: Source) -> Iterator[
 def run_info(seed: int, record: RunRecord) -> dict[str, Any]:
     """Put together section `run` of metrics.json."""
     hydra_config = HydraConfig.get()
+    verdict = assess(record)
     return {
         **describe_run([*hydra_config.overrides.task], seed),
         "choices": {g: str(c) for g, c in hydra_config.runtime.choices.items() if "/" not in g},
@@ -122,6 +133,7 @@ def run_info(seed: int, record: RunRecord) -> dict[str, Any]:
         "peak_rss_mb": record.peak_rss_mb,
         "mean_rss_mb": record.mean_rss_mb,
         "cpu_percent": record.cpu_percent,
+        "verdict": {"status": verdict.status.value, "reasons": [*verdict.reasons]},
         "input": record.counts,
         "system": record.result.counts,
     }
@@ -166,6 +178,8 @@ def main() -> int:
     except KNOWN_ERRORS as error:
         fail(error)
         return BAD_INPUT
+    except DoubtfulRunError:
+        return DOUBTFUL
     except KeyboardInterrupt:
         print("Aborted.", file=sys.stderr)
         return INTERRUPTED

@@ -37,6 +37,7 @@ class PreparedOdometry:
 
     def __init__(self, estimates):
         self._estimates = iter(estimates)
+        self.counts = {}
 
     def register(self, scan):
         return replace(next(self._estimates), stamp=scan.end_stamp)

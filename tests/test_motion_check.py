@@ -1,7 +1,5 @@
 """The second opinion on motions that the front end can't be sure of."""
 
-import logging
-
 import numpy as np
 import pytest
 from slam_support import corridor, error_of, planar, surfaces
@@ -58,11 +56,10 @@ def test_scans_are_checked_where_they_were_registered():
     assert error_of(found, X @ T)[0] < 0.05
 
 
-def test_where_nothing_fits_the_first_guess_stands():
+def test_where_nothing_fits_there_is_no_answer():
     elsewhere = surfaces(5, 1, boxes=4, extent=5.0) + np.array([0, 0, 300.0])
     guess = planar(1.0, 2.0, 0.3)
-    found = check_that_knows(4).resolve(elsewhere, np.eye(4), [guess, np.eye(4)])
-    np.testing.assert_array_equal(found, guess)
+    assert check_that_knows(4).resolve(elsewhere, np.eye(4), [guess, np.eye(4)]) is None
 
 
 @pytest.mark.parametrize(
@@ -80,19 +77,15 @@ def test_the_first_motion_is_found_at_standstill_and_at_speed(T):
     assert check.checks == 2
 
 
-def test_first_scans_that_do_not_fit_mean_standstill_and_a_warning(caplog):
+def test_first_scans_that_do_not_fit_have_no_motion():
     far_away = surfaces(9, 1, boxes=4, extent=5.0) + np.array([0, 0, 300.0])
-    with caplog.at_level(logging.WARNING):
-        found = MotionCheck(VOXEL).first_motion(scene(8, 1), far_away)
-    np.testing.assert_array_equal(found, np.eye(4))
-    assert "do not fit together" in caplog.text
+    assert MotionCheck(VOXEL).first_motion(scene(8, 1), far_away) is None
 
 
 @pytest.mark.parametrize("counts", [(0, 500), (500, 0), (0, 0), (3, 500), (500, 3), (12, 12)])
-def test_next_to_nothing_to_compare_means_standstill(counts):
+def test_next_to_nothing_to_compare_has_no_motion(counts):
     first, second = (scene(10, i)[:n] for i, n in enumerate(counts))
-    found = MotionCheck(VOXEL).first_motion(first, second + np.array([0, 0, 100.0]))
-    np.testing.assert_array_equal(found, np.eye(4))
+    assert MotionCheck(VOXEL).first_motion(first, second + np.array([0, 0, 100.0])) is None
 
 
 def test_a_motion_is_suspicious_outside_the_basin_around_its_prediction():

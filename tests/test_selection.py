@@ -220,7 +220,11 @@ def test_there_may_be_nothing_to_choose_from():
 # Choices once and for all.
 
 
-@pytest.mark.parametrize("selection", [Geometry(3.0), Decimate(), Random(seed=4)], ids=str)
+@pytest.mark.parametrize(
+    "selection",
+    [Geometry(3.0), Decimate(), Random(seed=4)],
+    ids=lambda selection: type(selection).__name__,
+)
 @pytest.mark.parametrize("count", [0, 1, 37, 149, 150, 400])
 def test_as_many_go_as_were_asked_for(selection, count):
     poses = at(scattered(4))

@@ -73,6 +73,7 @@ class DriftingOdometry:
             error = exp(drift + rng.normal(size=6) * SIGMAS * (np.any(drift) > 0))
             self.poses.append(self.poses[-1] @ step @ error)
         self.covariance = np.diag(SIGMAS**2 + drift**2)
+        self.counts = {}
         self._next = 0
 
     def register(self, scan):

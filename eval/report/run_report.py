@@ -40,9 +40,8 @@ def write_run_report(
         config_text: the composed config; empty if there is none.
     """
     page = Page(_title(path, evidence.run), _subtitle(evidence.run))
-    page.add(
-        "At a glance", "", _alarm(verdicts), charts.figures(_cards(verdicts)), _missing(verdicts)
-    )
+    alarm = _alarm(evidence.run, verdicts)
+    page.add("At a glance", "", alarm, charts.figures(_cards(verdicts)), _missing(verdicts))
     for section, (heading, sentence) in _SECTIONS.items():
         blocks = [*_views(section, evidence, verdicts), *_groups(section, verdicts)]
         if blocks:
@@ -84,9 +83,11 @@ def _cards(verdicts: Sequence[Verdict]) -> Iterator[charts.Card]:
             )
 
 
-def _alarm(verdicts: Sequence[Verdict]) -> Markup:
-    """Return the warnings of all measurements; several metrics may share one."""
-    sentences = [w for v in verdicts if v.measurement is not None for w in v.measurement.warnings]
+def _alarm(run: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Markup:
+    """Return what speaks against the run, and the warnings of all measurements, which may share one."""
+    judged = run.get("verdict", {})
+    sentences = [f"{judged['status']}: {reason}" for reason in judged.get("reasons", [])]
+    sentences += [w for v in verdicts if v.measurement is not None for w in v.measurement.warnings]
     return charts.warnings("Read these figures with care", dict.fromkeys(sentences))
 
 

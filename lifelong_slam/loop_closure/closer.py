@@ -75,6 +75,11 @@ class LoopCloser:
         self.places = Places(voxel_size, max(min_travel, _OVERLAP))
         self.counts: Counter[str] = Counter()
 
+    def part(self) -> None:
+        """Take note that odometry doesn't lead from the keyframes before to those that follow."""
+        self._local_maps.clear()
+        self.places.part()
+
     def close(
         self,
         query: Keyframe,

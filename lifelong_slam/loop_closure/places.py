@@ -67,6 +67,10 @@ class Places:
             self._anchors[place] = _Anchor(host, T_host_place, _EARLIER, 0.0)
             self._relocaliser.add_place(place, points)
 
+    def part(self) -> None:
+        """Take note that odometry doesn't lead from the local maps before to those that follow."""
+        self._locator.clear()
+
     def anchor(self, place: int) -> tuple[int, Array]:
         """Return the vertex that a place hangs on, and the place's (4, 4) pose in its frame."""
         anchor = self._anchors[place]
@@ -105,7 +109,11 @@ class Places:
             graph: that the places hang on.
             reachable: the vertices of the query's component.
         """
-        old = {i for i, anchor in self._anchors.items() if self._is_old(anchor, query)}
+        old = {
+            i
+            for i, anchor in self._anchors.items()
+            if anchor.vertex not in reachable or self._is_old(anchor, query)
+        }
         locations = self._relocaliser.locate(query, old)
         inside = [at for at in locations if self._anchors[at.reference_id].vertex in reachable]
         if inside:

@@ -106,6 +106,10 @@ class LocalMapBuilder:
         self._voxel_size = voxel_size
         self._window: deque[Keyframe] = deque()
 
+    def clear(self) -> None:
+        """Begin anew: odometry doesn't lead from the keyframes before to those that follow."""
+        self._window.clear()
+
     def add(self, keyframe: Keyframe) -> LocalMap | None:
         """Take in a keyframe and return the local map that it completes, if it does."""
         self._window.append(keyframe)
@@ -278,6 +282,10 @@ class SessionLocator:
         self._max_offset = max_offset
         self._max_turn = max_turn
         self._pending: deque[Location] = deque(maxlen=_PENDING)
+
+    def clear(self) -> None:
+        """Begin anew: odometry doesn't lead from the local maps before to those that follow."""
+        self._pending.clear()
 
     def agreeing(self, locations: list[Location], pose: Callable[[int], Array]) -> list[Location]:
         """Take in where the session's next local map fits and return the locations that agree.

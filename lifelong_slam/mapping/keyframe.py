@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.geometry import invert, rotation_angle, transform
-from lifelong_slam.odometry.odometry import OdometryEstimate
+from lifelong_slam.odometry.odometry import OdometryEstimate, Tracking
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,11 @@ class Keyframe:
 
 
 class KeyframeSelector:
-    """Takes a scan as keyframe once the sensor has moved or turned enough."""
+    """Takes a scan as keyframe once the sensor has moved or turned enough.
+
+    The first of a map is taken too. One that was only predicted isn't, unless it is the very first: nothing
+    is known of where it was that its neighbours don't know.
+    """
 
     def __init__(self, distance: float, rotation: float) -> None:
         """Set up.
@@ -53,7 +57,9 @@ class KeyframeSelector:
 
     def takes(self, estimate: OdometryEstimate) -> bool:
         """Tell whether this scan becomes a keyframe; remembers it if so."""
-        if self._last is not None:
+        if estimate.tracking is Tracking.PREDICTED and self._last is not None:
+            return False
+        if self._last is not None and estimate.tracking is Tracking.REGISTERED:
             motion = invert(self._last) @ estimate.T_odom_sensor
             moved = np.linalg.norm(motion[:3, 3]) >= self._distance
             if not moved and rotation_angle(motion) < self._rotation:

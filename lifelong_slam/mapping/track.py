@@ -23,6 +23,7 @@ class Track:
         self._T_odom_sensor = GrowingArray(np.zeros((0, 4, 4)))
         self._keyframes: list[int] = []
         self._at: list[int] = []  # index of each keyframe's scan
+        self._starts: list[bool] = []  # whether odometry leads nowhere from the keyframe before
         self.travelled = 0.0  # metres
 
     def __len__(self) -> int:
@@ -36,9 +37,15 @@ class Track:
         self._T_odom_sensor.append(T_odom_sensor)
         self._stamps.append(stamp)
 
-    def mark_keyframe(self, keyframe: int) -> None:
-        """Note that the newest scan is a keyframe."""
+    def mark_keyframe(self, keyframe: int, starts: bool = False) -> None:
+        """Note that the newest scan is a keyframe.
+
+        Args:
+            keyframe: its id.
+            starts: odometry doesn't connect it with the keyframe before.
+        """
         self._keyframes.append(keyframe)
+        self._starts.append(starts)
         self._at.append(len(self._stamps) - 1)
 
     @property
@@ -77,7 +84,8 @@ class Track:
         """Return the pose of every scan on the map.
 
         The correction that the graph makes to odometry is known at the keyframes before and after a
-        scan; in between it moves from one to the other in proportion to the time.
+        scan; in between it moves from one to the other in proportion to the time. Before a keyframe that
+        odometry doesn't lead to, scans hang on the last one alone.
 
         Args:
             T_map_keyframe: (K, 4, 4) of all keyframes in their order.
@@ -87,6 +95,7 @@ class Track:
         at = np.array(self._at)
         before = np.searchsorted(at, np.arange(len(stamps)), side="right") - 1
         after = np.minimum(before + 1, len(at) - 1)
+        after = np.where(np.array(self._starts)[after], before, after)
         T, T_odom = T_map_keyframe, odometry[at]
         correction = invert(T[before] @ invert(T_odom[before]) @ T_odom[after]) @ T[after]
         span = np.maximum(stamps[at[after]] - stamps[at[before]], 1)

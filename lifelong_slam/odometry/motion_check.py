@@ -8,7 +8,6 @@ not predict, or could not. Then, and only then, several motions are tried by gen
 planes slide freely along the ground, and the one that puts most points onto known surfaces wins.
 """
 
-import logging
 from collections import deque
 from collections.abc import Sequence
 
@@ -19,7 +18,6 @@ from lifelong_slam.geometry import exp, invert, rotation_angle, transform
 from lifelong_slam.registration import Cloud, Registration, register
 
 Array = NDArray[np.float64]
-logger = logging.getLogger(__name__)
 
 _RECENT_SCANS = 20  # what a suspicious motion is checked against
 _YAW_GUESSES = (
@@ -35,7 +33,12 @@ _MAX_ROTATION = 0.035  # rad (2 degrees) beside the prediction that ICP's basin 
 _MAX_TRANSLATION = 0.3  # the same in voxels
 _POOR = 0.9  # of the usual overlap, below which a fit is doubted
 _FORGETTING = 0.1  # weight of the newest check in the usual overlap
-_MIN_SUPPORT = 0.4  # below it not even the best guess is an answer
+# Below it not even the best guess is an answer: where nothing but the ground fits, one direction of three
+# is supported.
+_MIN_SUPPORT = 0.5
+_UNKNOWN = (
+    0.8  # of the usual share of points on known surfaces, below which a scan shows something new
+)
 
 
 class MotionCheck:
@@ -50,6 +53,8 @@ class MotionCheck:
         self._voxel_size = voxel_size
         self._recent: deque[tuple[Array, Array]] = deque(maxlen=_RECENT_SCANS)
         self._usual_support = 0.0
+        self._usual_known = 0.0
+        self._scans = 0
         self.checks = 0
 
     def remember(self, points: Array, T_odom_sensor: Array) -> None:
@@ -64,11 +69,23 @@ class MotionCheck:
             or np.linalg.norm(deviation[:3, 3]) > _MAX_TRANSLATION * self._voxel_size
         )
 
-    def resolve(self, points: Array, T_last: Array, guesses: Sequence[Array]) -> Array:
+    def shows_something_new(self, known: float) -> bool:
+        """Tell whether less of a scan than usual lies on known surfaces, and learn what is usual.
+
+        Args:
+            known: share of its points that do.
+        """
+        new = known < _UNKNOWN * self._usual_known
+        self._scans += 1
+        weight = max(_FORGETTING, 1 / self._scans)
+        self._usual_known += weight * (known - self._usual_known)
+        return new
+
+    def resolve(self, points: Array, T_last: Array, guesses: Sequence[Array]) -> Array | None:
         """Return the best pose for (N, 3) points, starting from guesses and turns of the last pose.
 
         A fit that is poorer than usual may be one row of windows off, so shifts are tried as well.
-        Falls back on the first guess where nothing fits.
+        None where nothing fits: the scan shows something else than the recent ones.
         """
         self.checks += 1
         target = np.vstack([transform(pose, cloud) for cloud, pose in self._recent])
@@ -79,25 +96,26 @@ class MotionCheck:
             shifted = self._register(target, points, shifts)
             best = max(best, shifted, key=lambda registration: registration.support)
         self._usual_support += _FORGETTING * (best.support - self._usual_support)
-        return best.T_target_source if best.support >= _MIN_SUPPORT else guesses[0]
+        return _supported(best)
 
-    def first_motion(self, first: Array, second: Array) -> Array:
+    def first_motion(self, first: Array, second: Array) -> Array | None:
         """Return T_first_second of two scans about which nothing is known.
 
-        Tries standing still and motions in all horizontal directions; the identity if none fits.
+        Tries standing still and motions in all horizontal directions; None if none fits.
         """
         self.checks += 1
         best = self._register(first, second, [np.eye(4), *_shifts(_START_DISTANCES)])
-        if best.support < _MIN_SUPPORT:
-            logger.warning("the first two scans do not fit together; assuming standstill")
-            return np.eye(4)
-        return best.T_target_source
+        return _supported(best)
 
     def _register(self, target: Array, source: Array, guesses: Sequence[Array]) -> Registration:
         voxel = self._voxel_size / 2
         return register(
             Cloud.prepare(target, voxel), Cloud.prepare(source, voxel), guesses, self._voxel_size
         )
+
+
+def _supported(best: Registration) -> Array | None:
+    return best.T_target_source if best.support >= _MIN_SUPPORT else None
 
 
 def _shifts(distances: Sequence[float]) -> list[Array]:

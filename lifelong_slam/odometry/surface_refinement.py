@@ -6,6 +6,8 @@ et al., ICRA 2021) against a Gaussian voxel map of the recent surroundings remov
 is the information that the registration really has, which the pose graph needs.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
@@ -24,7 +26,21 @@ _MIN_INLIERS = 50  # points on known surfaces without which there is nothing to 
 _FORGETTING = 0.05  # weight of the newest scan in how far refinements usually move a pose
 _FAR = 2.0  # times the usual, beyond which a refinement was drawn away by something that moves
 _LEARNING = 20  # scans before it is known what is usual
-_LOST_SIGMA = 0.5  # voxels; how well an unrefined pose is known
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """A cloud's pose in the map of surfaces.
+
+    Attributes:
+        T_odom_sensor: (4, 4).
+        covariance: (6, 6) in the cloud's frame, rotation (rad) then translation (m).
+        known: share of the cloud's points that lie on surfaces of the map.
+    """
+
+    T_odom_sensor: Array
+    covariance: Array
+    known: float
 
 
 class SurfaceRefinement:
@@ -41,15 +57,13 @@ class SurfaceRefinement:
         self._count = 0
         self.refused = 0
 
-    def refine(self, cloud: Cloud, guess: Array) -> tuple[Array, Array]:
-        """Return the refined (4, 4) pose in the map and its (6, 6) covariance in the cloud's frame.
+    def refine(self, cloud: Cloud, guess: Array) -> Refined | None:
+        """Refine a cloud's (4, 4) pose in the map.
 
-        The first scan defines the map and has no error. Voxelised GICP has no robust kernel, KISS-ICP
-        has: a refinement that moves the pose much further than usual was drawn by a moving thing. Then,
-        and where too little is known, the guess is returned, with a covariance that says so.
+        Voxelised GICP has no robust kernel, KISS-ICP has: a refinement that moves the pose much further
+        than usual was drawn by a moving thing. Then the guess is returned, with a covariance that says
+        so. None where next to nothing of the cloud lies on known surfaces. The map must not be empty.
         """
-        if self._last_insertion is None:
-            return guess, np.zeros((6, 6))
         result = small_gicp.align(
             self._map,
             cloud.points,
@@ -60,14 +74,14 @@ class SurfaceRefinement:
         )
         T = np.asarray(result.T_target_source)
         if result.num_inliers < _MIN_INLIERS or not np.isfinite(T).all():
-            self.refused += 1
-            return guess, self.coarse_covariance
+            return None
         covariance = covariance_of(np.asarray(result.H), result.error, result.num_inliers)
+        known = result.num_inliers / len(cloud)
         if self._is_far(float(np.linalg.norm(T[:3, 3] - guess[:3, 3]))):
             self.refused += 1
             dispute = log(invert(guess) @ T)
-            return guess, covariance + np.outer(dispute, dispute)
-        return T, covariance
+            return Refined(guess, covariance + np.outer(dispute, dispute), known)
+        return Refined(T, covariance, known)
 
     def _is_far(self, move: float) -> bool:
         """Tell whether a refinement moves a pose by more than is usual, and learn what is (m)."""
@@ -87,9 +101,3 @@ class SurfaceRefinement:
                 return
         self._heap.call(self._map.insert, cloud.points, T_odom_sensor)
         self._last_insertion = T_odom_sensor
-
-    @property
-    def coarse_covariance(self) -> Array:
-        """(6, 6) covariance of a pose that nothing has refined."""
-        sigma = _LOST_SIGMA * self._voxel_size
-        return np.diag([sigma**2 / 25] * 3 + [sigma**2] * 3)  # rad: sigma seen over 5 m

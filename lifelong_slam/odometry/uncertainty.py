@@ -22,6 +22,8 @@ _FORGETTING = 0.05  # weight of the newest scan: a memory of two seconds at 10 H
 _THIRD_DIFFERENCE = 20.0  # 1 + 9 + 9 + 1, the variance of a third difference of white noise
 _VOTERS = 200  # points that stand for a scan's surfaces; 400 changed NEES by a fifth at most
 _CLOCKS = 1000  # points that tell when a place was swept, a third of a degree apart in 360
+_ANGULAR_ACCELERATION = 0.5  # rad/s^2 that constant velocity leaves out, a standard deviation
+_ACCELERATION = 1.0  # m/s^2, the same; a car that brakes gently
 _NEIGHBOURS = 10  # points around a voter, itself among them, as many as its plane was fitted to
 
 
@@ -49,6 +51,12 @@ class RegistrationNoise:
         weight = max(_FORGETTING, 1 / self._count)
         sample = np.outer(change, change) / _THIRD_DIFFERENCE
         self.covariance = (1 - weight) * self.covariance + weight * sample
+
+
+def extrapolation_covariance(seconds: float) -> Array:
+    """Return the (6, 6) covariance of a pose that constant velocity was extrapolated to, for so long."""
+    rotation, translation = np.array([_ANGULAR_ACCELERATION, _ACCELERATION]) * seconds**2 / 2
+    return np.diag([rotation**2] * 3 + [translation**2] * 3)
 
 
 def distortion_bias(cloud: Cloud, scan: Scan, velocity: Array, lag: Array) -> Array:
