@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import NANOSECONDS, Scan
+from lifelong_slam.sources.ordering import in_order
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ class InputCounts:
             (from its attribute `unreadable`, where it has one), though they don't count as read.
         dropped_points: points left out for coordinates or times that are NaN or infinite.
         gaps: intervals longer than `GAP_FACTOR` times the usual one.
+        reordered: scans that came behind later ones, and were put back in order.
     """
 
     read: int = 0
@@ -44,6 +46,7 @@ class InputCounts:
     skipped: Counter[str] = field(default_factory=Counter)
     dropped_points: int = 0
     gaps: int = 0
+    reordered: int = 0
 
     def summary(self) -> str:
         """Return one line for the end of a run."""
@@ -53,14 +56,17 @@ class InputCounts:
             parts.append(f"{self.dropped_points} non-finite points dropped")
         if self.gaps:
             parts.append(f"{self.gaps} gaps")
+        if self.reordered:
+            parts.append(f"{self.reordered} put back in order")
         return ", ".join(parts)
 
 
 def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     """Yield scans that are finite, not empty and strictly later than the one before.
 
-    `counts` is kept up to date while scans are drawn. Each kind of trouble is logged as a warning
-    when first met. Gaps in time are only noted: they are for SLAM to handle.
+    Scans that came a little late are put back in order. `counts` is kept up to date while scans are
+    drawn. Each kind of trouble is logged as a warning when first met. Gaps in time are only noted:
+    they are for SLAM to handle.
 
     Raises:
         SourceError: the source ended and not one scan was usable.
@@ -77,7 +83,8 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
 def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     intervals: deque[int] = deque(maxlen=_INTERVALS)
     last: Scan | None = None
-    for scan, after in _with_next(source):
+    ordered = in_order(source, lambda late: _note_late(late, counts))
+    for scan, after in _with_next(ordered):
         counts.read += 1
         scan = _finite(scan, counts)
         if reason := _why_skip(scan, last, after):
@@ -140,6 +147,12 @@ def _skip(scan: Scan, reason: str, counts: InputCounts) -> None:
     counts.skipped[reason] += 1
     if counts.skipped[reason] == 1:
         _log.warning("scan %d at %s s skipped: %s", counts.read, _seconds(scan), reason)
+
+
+def _note_late(scan: Scan, counts: InputCounts) -> None:
+    counts.reordered += 1
+    if counts.reordered == 1:
+        _log.warning("the scan at %s s came behind a later one: put back in order", _seconds(scan))
 
 
 def _note_gap(scan: Scan, last: int, intervals: deque[int], counts: InputCounts) -> None:
