@@ -140,7 +140,7 @@ def _choose_topic(topics: dict[str, Topic], topic: str | None, path: Path) -> st
     if topic is not None:
         _check_topic(topics, topic, CLOUD_TYPES, "point cloud", path)
         return topic
-    candidates = [t for t in topics.values() if t.msgtype in CLOUD_TYPES and t.count]
+    candidates = _fitting(topics, CLOUD_TYPES, filled=True)
     if len(candidates) == 1:
         return candidates[0].name
     if candidates:
@@ -148,7 +148,10 @@ def _choose_topic(topics: dict[str, Topic], topic: str | None, path: Path) -> st
             f"{path} has {len(candidates)} point cloud topics; name one as topic: "
             f"{_listed(candidates)}"
         )
-    raise TopicError(f"{path} has no point cloud topic; its topics: {_listed(topics.values())}")
+    raise TopicError(
+        f"{path} has no point cloud topic; its topics: {_listed(topics.values())}"
+        f"{_unreadable_encodings(topics.values())}"
+    )
 
 
 def _check_topic(
@@ -159,17 +162,29 @@ def _check_topic(
             f"{path} has no topic '{topic}'.{did_you_mean(topic, topics)} "
             f"Its topics: {_listed(topics.values())}"
         )
+    if unreadable := _unreadable_encodings([topics[topic]]):
+        raise TopicError(f"{path}: {topics[topic]}{unreadable}")
     if topics[topic].msgtype not in types:
-        fitting = [t for t in topics.values() if t.msgtype in types]
         raise TopicError(
             f"{path}: topic '{topic}' is of type {topics[topic].msgtype}, not a {what}; "
-            f"{what} topics there: {_listed(fitting)}"
+            f"{what} topics there: {_listed(_fitting(topics, types))}"
         )
 
 
+def _fitting(topics: dict[str, Topic], types: tuple[str, ...], filled: bool = False) -> list[Topic]:
+    fitting = [t for t in topics.values() if t.msgtype in types and t.readable]
+    return [t for t in fitting if t.count or not filled]
+
+
 def _listed(topics: Iterable[Topic]) -> str:
-    listed = [f"{t.name} ({t.msgtype}, {t.count} messages)" for t in topics]
-    return ", ".join(sorted(listed)) or "none"
+    return ", ".join(sorted(map(str, topics))) or "none"
+
+
+def _unreadable_encodings(topics: Iterable[Topic]) -> str:
+    encodings = sorted({topic.encoding for topic in topics if not topic.readable})
+    if not encodings:
+        return ""
+    return f": messages in {' or '.join(encodings)} can't be read, only those of ROS 1 and ROS 2"
 
 
 def _static_frames(recording: Recording) -> StaticFrames:
