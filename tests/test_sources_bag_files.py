@@ -82,6 +82,15 @@ def test_write_ahead_log_of_a_last_part_that_metadata_does_not_list(tmp_path):
     assert contents(folder) == before
 
 
+def test_log_in_a_folder_with_metadata(tmp_path):
+    file = killed(tmp_path, 4)
+    other = killed(tmp_path, 2, name="other")
+    metadata = write_bag(tmp_path / "whole", "db3", sweeps("db3", 4)) / "metadata.yaml"
+    for source in (metadata, other, other.with_name(other.name + "-wal")):
+        shutil.copy(source, file.parent)
+    assert_same(BagSource(str(file.parent)), whole_scans(tmp_path / "same"))
+
+
 def test_rollback_journal_of_a_killed_recorder(tmp_path):
     """What was being written when the recorder was killed is undone."""
     live = storage_file(write_bag(tmp_path, "db3", sweeps("db3", COUNT, 4000)))
@@ -128,7 +137,7 @@ def test_parts_that_metadata_does_not_list_are_read(tmp_path, kind, caplog):
         shutil.copy(storage_file(write_bag(tmp_path, kind, some, name)), path)
     source = BagSource(str(path))
     assert [s.stamp for s in source] == [m[2] for m in messages]
-    assert f"rec_1.{kind}, rec_10.{kind} read as well" in caplog.text
+    assert f"rec_1.{kind}, rec_10.{kind} read as well, not in metadata.yaml" in caplog.text
 
 
 @pytest.mark.parametrize("metadata", [True, False])

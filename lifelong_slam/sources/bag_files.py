@@ -10,6 +10,7 @@ import yaml
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.sources.natural_order import natural_order
+from lifelong_slam.sources.unfinished_db3 import is_unfinished
 
 _log = logging.getLogger(__name__)
 
@@ -22,7 +23,7 @@ def bag_paths(path: Path) -> list[Path]:
     """Return what a reader is given: one file, a ROS 2 folder, or the parts of a bag.
 
     Parts that a folder's metadata.yaml doesn't list, as a killed recorder leaves them, are among
-    them. Other bag files in a folder are named in a warning.
+    them. Other bag files in a folder are named in a warning. Files that are unfinished come as such.
 
     Raises:
         SourceError: there is no such path, or no bag in it.
@@ -34,7 +35,7 @@ def bag_paths(path: Path) -> list[Path]:
             raise SourceError(f"{path} is empty (0 bytes): there is no recording in it")
         return [path]
     if (path / _METADATA).is_file():
-        return _listed_and_unlisted(path)
+        return _of_folder(path)
     if parts := _parts(path):
         _log_left_out(path, [part.name for part in parts])
         return parts
@@ -49,21 +50,21 @@ def storage_files(paths: Iterable[Path]) -> list[Path]:
     return files
 
 
-def _listed_and_unlisted(folder: Path) -> list[Path]:
-    """Return the folder itself; or its files, where some of them belong to it unlisted."""
+def _of_folder(folder: Path) -> list[Path]:
+    """Return the folder itself; or its files, where some belong to it unlisted or are unfinished."""
     listed, compressed = _listed(folder)
-    parts = _parts(folder)
     if not listed or not all((folder / name).is_file() for name in listed):
         return [folder]  # all parts are read as those of a damaged recording
     series = {_series(name) for name in listed}
-    unlisted = [p for p in parts if p.name not in listed and _series(p.name) in series]
-    if compressed or not unlisted:
+    own = [p for p in _parts(folder) if p.name in listed or _series(p.name) in series]
+    unlisted = [part.name for part in own if part.name not in listed]
+    if compressed or not (unlisted or any(map(is_unfinished, own))):
         _log_left_out(folder, listed)
         return [folder]
-    names = [part.name for part in unlisted]
-    _log.warning("%s: %s read as well, though not in %s", folder, ", ".join(names), _METADATA)
-    _log_left_out(folder, [*listed, *names])
-    return [part for part in parts if part.name in {*listed, *names}]
+    if unlisted:
+        _log.warning("%s: %s read as well, not in %s", folder, ", ".join(unlisted), _METADATA)
+    _log_left_out(folder, [part.name for part in own])
+    return own
 
 
 def _listed(folder: Path) -> tuple[list[str], bool]:

@@ -109,12 +109,11 @@ def open_recording(path: Path) -> Recording:
             take in the log of a recorder that was killed.
     """
     paths = bag_paths(path)
-    files = storage_files(paths)
-    if not any(is_unfinished(file) for file in files):
+    if not any(map(is_unfinished, paths)):
         return _open(path, paths)
     scratch = TemporaryDirectory(prefix="lifelong_slam_")
     folder = Path(scratch.name)
-    recording = _open(path, [finished(f, folder) if is_unfinished(f) else f for f in files])
+    recording = _open(path, [finished(p, folder) if is_unfinished(p) else p for p in paths])
     finalize(recording, scratch.cleanup)
     return recording
 
