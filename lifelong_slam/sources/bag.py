@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError, TopicError, did_you_mean
-from lifelong_slam.scan import Scan
+from lifelong_slam.scan import NANOSECONDS, Scan
 from lifelong_slam.sources.assembly import assemble
 from lifelong_slam.sources.bag_reference import REFERENCE_TYPES, read_reference
 from lifelong_slam.sources.channel import Topic
@@ -18,6 +18,7 @@ from lifelong_slam.sources.headers import Arrival, read_header
 from lifelong_slam.sources.joined_sweeps import join_sweeps
 from lifelong_slam.sources.lidars import Lidars
 from lifelong_slam.sources.livox import LIVOX_TYPES, decode_livox
+from lifelong_slam.sources.ordering import in_order
 from lifelong_slam.sources.pointcloud2 import Cloud, decode
 from lifelong_slam.sources.recording import Recording, open_recording
 from lifelong_slam.sources.static_frames import BASE_FRAMES, StaticFrames, bare
@@ -42,6 +43,7 @@ class BagSource:
         reference_topic: the topic of the reference poses, or None.
         unreadable: messages of the topic that could not be used in the latest pass: they can't be
             decoded, or it isn't known where their LiDAR sits.
+        reordered: scans put back in order in the latest pass.
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class BagSource:
         self.path = Path(path)
         self.reference_topic = reference_topic
         self.unreadable = 0
+        self.reordered = 0
         self._recording = open_recording(self.path)
         topics = dict(self._recording.topics)
         self.topic = _choose_topic(topics, topic, self.path)
@@ -83,18 +86,21 @@ class BagSource:
         return self._info.count
 
     def __iter__(self) -> Iterator[Scan]:
-        """Yield the clouds in order of receive time; undecodable ones are counted and left out.
+        """Yield the clouds in recorded order, those that came late put back in their places.
+
+        Undecodable ones are counted and left out.
 
         Raises:
             SourceError: the clouds have no x, y, z, or not one could be decoded.
         """
-        self.unreadable = 0
+        self.unreadable = self.reordered = 0
         self._lidars.rewind()
         lidars: deque[str] = deque()
         sweeps = assemble(self._clouds(lidars), self._where)
         named_sweeps = ((lidars.popleft(), sweep) for sweep in sweeps)
+        scans = join_sweeps(named_sweeps, lambda: self._lidars.turn)
         count = 0
-        for scan in join_sweeps(named_sweeps, lambda: self._lidars.turn):
+        for scan in in_order(scans, self._note_late):
             count += 1
             yield scan
         self._log_end(count)
@@ -171,6 +177,14 @@ class BagSource:
         self.unreadable += 1
         if self.unreadable == 1:
             _log.warning("%s: unreadable message on %s: %s", self.path, self.topic, error)
+
+    def _note_late(self, scan: Scan) -> None:
+        self.reordered += 1
+        if self.reordered == 1:
+            _log.warning(
+                "%s: the scan at %.3f s came behind a later one: put back in order",
+                *(self._where, scan.stamp / NANOSECONDS),
+            )
 
     def _log_end(self, scans: int) -> None:
         if self.unreadable:

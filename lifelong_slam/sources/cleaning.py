@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import NANOSECONDS, Scan
-from lifelong_slam.sources.ordering import in_order
 
 _log = logging.getLogger(__name__)
 
@@ -38,7 +37,8 @@ class InputCounts:
             (from its attribute `unreadable`, where it has one), though they don't count as read.
         dropped_points: points left out for coordinates or times that are NaN or infinite.
         gaps: intervals longer than `GAP_FACTOR` times the usual one.
-        reordered: scans that came behind later ones, and were put back in order.
+        reordered: scans that the source put back in order (from its attribute `reordered`, where it
+            has one).
     """
 
     read: int = 0
@@ -64,9 +64,8 @@ class InputCounts:
 def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     """Yield scans that are finite, not empty and strictly later than the one before.
 
-    Scans that came a little late are put back in order. `counts` is kept up to date while scans are
-    drawn. Each kind of trouble is logged as a warning when first met. Gaps in time are only noted:
-    they are for SLAM to handle.
+    `counts` is kept up to date while scans are drawn. Each kind of trouble is logged as a warning
+    when first met. Gaps in time are only noted: they are for SLAM to handle.
 
     Raises:
         SourceError: the source ended and not one scan was usable.
@@ -76,6 +75,7 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     finally:
         if unreadable := getattr(source, "unreadable", 0):
             counts.skipped[UNREADABLE] = unreadable
+        counts.reordered = getattr(source, "reordered", 0)
     if counts.used == 0:
         raise SourceError(f"no usable scans in this recording: {counts.summary()}")
 
@@ -83,8 +83,7 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
 def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     intervals: deque[int] = deque(maxlen=_INTERVALS)
     last: Scan | None = None
-    ordered = in_order(source, lambda late: _note_late(late, counts))
-    for scan, after in _with_next(ordered):
+    for scan, after in _with_next(source):
         counts.read += 1
         scan = _finite(scan, counts)
         if reason := _why_skip(scan, last, after):
@@ -147,12 +146,6 @@ def _skip(scan: Scan, reason: str, counts: InputCounts) -> None:
     counts.skipped[reason] += 1
     if counts.skipped[reason] == 1:
         _log.warning("scan %d at %s s skipped: %s", counts.read, _seconds(scan), reason)
-
-
-def _note_late(scan: Scan, counts: InputCounts) -> None:
-    counts.reordered += 1
-    if counts.reordered == 1:
-        _log.warning("the scan at %s s came behind a later one: put back in order", _seconds(scan))
 
 
 def _note_gap(scan: Scan, last: int, intervals: deque[int], counts: InputCounts) -> None:
