@@ -215,4 +215,5 @@ def _flat(counts: InputCounts) -> dict[str, int]:
         **skipped,
         "dropped_points": counts.dropped_points,
         "gaps": counts.gaps,
+        "reordered": counts.reordered,
     }

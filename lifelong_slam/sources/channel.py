@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+CDR, ROS1 = "cdr", "ros1"
+
 
 @dataclass(frozen=True, slots=True)
 class Topic:
@@ -11,13 +13,27 @@ class Topic:
         name: its name.
         msgtype: message type in ROS 2 notation, ``package/msg/Type``.
         count: number of messages.
-        ros1: whether messages are serialised as in ROS 1 instead of CDR.
+        encoding: how messages are serialised: "ros1", "cdr", or what can't be read ("protobuf").
     """
 
     name: str
     msgtype: str
     count: int
-    ros1: bool
+    encoding: str
+
+    @property
+    def ros1(self) -> bool:
+        """Whether messages are serialised as in ROS 1."""
+        return self.encoding == ROS1
+
+    @property
+    def readable(self) -> bool:
+        """Whether messages can be decoded."""
+        return self.encoding in (CDR, ROS1)
+
+    def __str__(self) -> str:
+        kind = self.msgtype if self.readable else f"{self.msgtype} in {self.encoding}"
+        return f"{self.name} ({kind}, {self.count} messages)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +45,16 @@ class Channel:
         msgtype: message type in ROS 2 notation, ``package/msg/Type``.
         definition: text of the message definition, empty where the file has none.
         idl: whether the definition is OMG IDL instead of a .msg file.
-        ros1: whether messages are serialised as in ROS 1 instead of CDR.
+        encoding: how messages are serialised, as in `Topic`.
     """
 
     topic: str
     msgtype: str
     definition: str
     idl: bool = False
-    ros1: bool = False
+    encoding: str = CDR
+
+    @property
+    def ros1(self) -> bool:
+        """Whether messages are serialised as in ROS 1."""
+        return self.encoding == ROS1

@@ -37,6 +37,8 @@ class InputCounts:
             (from its attribute `unreadable`, where it has one), though they don't count as read.
         dropped_points: points left out for coordinates or times that are NaN or infinite.
         gaps: intervals longer than `GAP_FACTOR` times the usual one.
+        reordered: scans that the source put back in order (from its attribute `reordered`, where it
+            has one).
     """
 
     read: int = 0
@@ -44,6 +46,7 @@ class InputCounts:
     skipped: Counter[str] = field(default_factory=Counter)
     dropped_points: int = 0
     gaps: int = 0
+    reordered: int = 0
 
     def summary(self) -> str:
         """Return one line for the end of a run."""
@@ -53,6 +56,8 @@ class InputCounts:
             parts.append(f"{self.dropped_points} non-finite points dropped")
         if self.gaps:
             parts.append(f"{self.gaps} gaps")
+        if self.reordered:
+            parts.append(f"{self.reordered} put back in order")
         return ", ".join(parts)
 
 
@@ -70,6 +75,7 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
     finally:
         if unreadable := getattr(source, "unreadable", 0):
             counts.skipped[UNREADABLE] = unreadable
+        counts.reordered = getattr(source, "reordered", 0)
     if counts.used == 0:
         raise SourceError(f"no usable scans in this recording: {counts.summary()}")
 

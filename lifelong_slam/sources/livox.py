@@ -11,7 +11,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong_slam.scan import NANOSECONDS
+from lifelong_slam.sources.headers import CDR_PREFIX, byte_order, read_header
 from lifelong_slam.sources.pointcloud2 import Cloud
 
 LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
@@ -21,27 +21,22 @@ _POINT_BYTES = 19
 _FIXED_BYTES = 16  # timebase, point_num, lidar_id, rsvd
 
 
-def decode_livox(raw: bytes, ros1: bool) -> tuple[int, Cloud]:
-    """Return the header stamp in ns and the cloud of a serialised message.
+def decode_livox(raw: bytes, ros1: bool) -> Cloud:
+    """Return the cloud of a serialised message.
 
     Raises:
         ValueError: the message is cut short.
-        struct.error: so is its header.
+        struct.error: so is what comes before its points.
     """
-    order = "<" if ros1 or raw[1] & 1 else ">"
-    body = memoryview(raw)[0 if ros1 else 4 :]  # CDR starts with 4 bytes on itself
-    start = 4 if ros1 else 0  # ROS 1 headers start with a sequence number
-    seconds, nanoseconds, frame_bytes = struct.unpack_from(f"{order}III", body, start)
-    position = start + 12 + frame_bytes
+    order, position = byte_order(raw, ros1), read_header(raw, ros1).end
     if not ros1:
-        position += -position % 8
-    (count,) = struct.unpack_from(f"{order}I", body, position + _FIXED_BYTES)
+        position += -(position - CDR_PREFIX) % 8
+    (count,) = struct.unpack_from(f"{order}I", raw, position + _FIXED_BYTES)
     position += _FIXED_BYTES + 4
     stride = _POINT_BYTES if ros1 else _POINT_BYTES + 1
-    if count and position + (count - 1) * stride + _POINT_BYTES > len(body):
-        raise ValueError(f"{count} points in {len(body) - position} bytes of data")
+    if count and position + (count - 1) * stride + _POINT_BYTES > len(raw):
+        raise ValueError(f"{count} points in {len(raw) - position} bytes of data")
     kind = np.dtype([("t", f"{order}u4"), ("xyz", f"{order}f4", (3,)), ("rest", "u1", (3,))])
-    points: NDArray[np.void] = np.ndarray((count,), kind, body, position, (stride,))
+    points: NDArray[np.void] = np.ndarray((count,), kind, raw, position, (stride,))
     times = points["t"].astype(np.uint32)
-    stamp = seconds * NANOSECONDS + nanoseconds
-    return stamp, Cloud(points["xyz"].astype(np.float64), {"offset_time": times})
+    return Cloud(points["xyz"].astype(np.float64), {"offset_time": times})

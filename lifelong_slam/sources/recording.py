@@ -3,19 +3,21 @@
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
+from weakref import finalize
 
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
 from lifelong_slam.errors import SourceError
-from lifelong_slam.sources.channel import Topic
-from lifelong_slam.sources.natural_order import natural_order
+from lifelong_slam.sources.bag_files import bag_paths, storage_files
+from lifelong_slam.sources.channel import ROS1, Topic
 from lifelong_slam.sources.salvage import SalvagedRecording, is_bag
 from lifelong_slam.sources.typestores import default_typestore
+from lifelong_slam.sources.unfinished_db3 import finished, is_unfinished
 
 _log = logging.getLogger(__name__)
-
-_SUFFIXES = (".bag", ".mcap", ".db3")
 
 
 class Recording(Protocol):
@@ -54,7 +56,12 @@ class IndexedRecording:
         with self._open() as reader:
             self._store = reader.typestore
             self._topics = {
-                name: Topic(name, info.msgtype or "several types", info.msgcount, self._ros1)
+                name: Topic(
+                    name,
+                    info.msgtype or "several types",
+                    info.msgcount,
+                    _encoding(info.connections),
+                )
                 for name, info in reader.topics.items()
             }
 
@@ -98,9 +105,20 @@ def open_recording(path: Path) -> Recording:
     """Open a bag, file or folder, of any of the formats; a damaged one as far as it is readable.
 
     Raises:
-        SourceError: there is no such path, or nothing in it can be read as a bag.
+        SourceError: there is no such path, nothing in it can be read as a bag, or there is no room to
+            take in the log of a recorder that was killed.
     """
-    paths = _bag_paths(path)
+    paths = bag_paths(path)
+    if not any(map(is_unfinished, paths)):
+        return _open(path, paths)
+    scratch = TemporaryDirectory(prefix="lifelong_slam_")
+    folder = Path(scratch.name)
+    recording = _open(path, [finished(p, folder) if is_unfinished(p) else p for p in paths])
+    finalize(recording, scratch.cleanup)
+    return recording
+
+
+def _open(path: Path, paths: list[Path]) -> Recording:
     try:
         return IndexedRecording(paths)
     except Exception as error:  # damaged files raise whatever the parser met first
@@ -112,40 +130,20 @@ def open_recording(path: Path) -> Recording:
     count = sum(topic.count for topic in salvaged.topics.values())
     if count == 0:
         raise SourceError(f"{path} is damaged and no message in it is whole: {reason}")
-    _log.warning(
-        "%s is cut short or damaged, or has no index (%s): %d whole messages on %d topics are used",
-        *(path, reason, count, len(salvaged.topics)),
-    )
+    if paths != files or not salvaged.is_whole:  # a folder that is no ROS 2 bag, or damaged files
+        _log.warning(
+            "%s is cut short or damaged, or has no index (%s): %d whole messages on %d topics are used",
+            *(path, reason, count, len(salvaged.topics)),
+        )
     return salvaged
 
 
-def storage_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the files that hold messages: those of a folder, or the paths themselves."""
-    files = []
-    for path in paths:
-        files += _parts(path) if path.is_dir() else [path]
-    return files
-
-
-def _bag_paths(path: Path) -> list[Path]:
-    """Return what the reader is given: one file, a ROS 2 folder, or the parts of a split bag."""
-    if not path.exists():
-        raise SourceError(f"no such file or folder: {path}")
-    if path.is_file():
-        if path.stat().st_size == 0:
-            raise SourceError(f"{path} is empty (0 bytes): there is no recording in it")
-        return [path]
-    if (path / "metadata.yaml").is_file():
-        return [path]
-    if parts := _parts(path):
-        return parts
-    raise SourceError(f"{path} holds no bag: expected *.bag, *.mcap, or metadata.yaml with *.db3")
-
-
-def _parts(folder: Path) -> list[Path]:
-    """Return the bag files in a folder, of the first kind that is there."""
-    kinds = (sorted(folder.glob(f"*{suffix}"), key=natural_order) for suffix in _SUFFIXES)
-    return next((files for files in kinds if files), [])
+def _encoding(connections: Iterable[Connection]) -> str:
+    """Return how the messages of a topic are serialised."""
+    kinds = {
+        c.ext.serialization_format for c in connections if isinstance(c.ext, ConnectionExtRosbag2)
+    }
+    return " and ".join(sorted(kinds)) or ROS1
 
 
 def _reason(error: Exception) -> str:

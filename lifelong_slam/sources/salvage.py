@@ -39,10 +39,15 @@ class SalvagedRecording:
         self._store: Typestore | None = None
 
     @property
+    def is_whole(self) -> bool:
+        """Whether as many messages were found as the files say they hold; only MCAP tells."""
+        return sum(self._counts.values()) == sum(map(salvage_mcap.stated_count, self._paths))
+
+    @property
     def topics(self) -> Mapping[str, Topic]:
         """The topics that have a whole message, by name."""
         return {
-            name: Topic(name, channel.msgtype, self._counts[name], channel.ros1)
+            name: Topic(name, channel.msgtype, self._counts[name], channel.encoding)
             for name, channel in self._channels.items()
         }
 

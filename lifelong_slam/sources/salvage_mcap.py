@@ -12,12 +12,13 @@ from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.typesys.msg import normalize_msgtype
 
-from lifelong_slam.sources.channel import Channel
+from lifelong_slam.sources.channel import CDR, Channel
 
 _log = logging.getLogger(__name__)
 
@@ -42,6 +43,17 @@ def walk(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
             channels[record.id] = _channel(record, schemas.get(record.schema_id))
         elif isinstance(record, Message) and record.channel_id in channels:
             yield channels[record.channel_id], record.log_time, record.data
+
+
+def stated_count(path: Path) -> int:
+    """Return the number of messages that an MCAP file's summary states, -1 if there is none."""
+    try:
+        with path.open("rb") as file:
+            summary = SeekingReader(file, record_size_limit=path.stat().st_size).get_summary()
+    except (*_CUT, OSError, EOFError, OverflowError) as error:
+        _log.debug("%s: no summary: %r", path, error)
+        return -1
+    return summary.statistics.message_count if summary and summary.statistics else -1
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
@@ -99,11 +111,16 @@ def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:
     encoding = schema.encoding if schema else ""
     return Channel(
         topic=record.topic,
-        msgtype=str(normalize_msgtype(schema.name)) if schema else "",
+        msgtype=_msgtype(schema.name) if schema else "",
         definition=schema.data.decode(errors="replace") if schema else "",
         idl="idl" in encoding,
-        ros1=record.message_encoding == "ros1",
+        encoding=record.message_encoding or CDR,
     )
+
+
+def _msgtype(name: str) -> str:
+    """Return a ROS type in ROS 2 notation, and one of another kind as it is."""
+    return str(normalize_msgtype(name)) if "/" in name else name
 
 
 class _WholeReads:

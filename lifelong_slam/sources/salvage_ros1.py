@@ -17,7 +17,7 @@ from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.typesys.msg import normalize_msgtype
 
 from lifelong_slam.scan import NANOSECONDS
-from lifelong_slam.sources.channel import Channel
+from lifelong_slam.sources.channel import ROS1, Channel
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ def _message(
             topic="/" + "/".join(p for p in _text(header, "topic").split("/") if p),
             msgtype=str(normalize_msgtype(_text(about, "type"))),
             definition=_text(about, "message_definition"),
-            ros1=True,
+            encoding=ROS1,
         )
     elif number in channels and len(header.get("time", b"")) == 8:
         seconds, nanoseconds = _time.unpack(header["time"])
