@@ -1,11 +1,14 @@
 """From decoded clouds to scans: the first few decide how the recording holds its point times."""
 
+import logging
 from collections.abc import Iterable, Iterator
 from itertools import islice
 
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.point_times import PointTimes, Sweep
 from lifelong_slam.sources.pointcloud2 import Cloud
+
+_log = logging.getLogger(__name__)
 
 _PROBES = 10  # sweeps with returns to decide from
 _MOST = 100  # sweeps to hold meanwhile
@@ -18,13 +21,24 @@ def assemble(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Scan]:
     the encoding, they are passed on without times, and the next few are asked.
     """
     times = PointTimes(where)
-    sweeps = (Sweep(stamp, cloud.times, cloud.points) for stamp, cloud in clouds)
+    sweeps = _sweeps(clouds, where)
     while times.encoding is None and (probes := _probes(sweeps)):
         times.decide(probes)
         while probes:
             yield _scan(probes.pop(0), times)
     for sweep in sweeps:
         yield _scan(sweep, times)
+
+
+def _sweeps(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Sweep]:
+    said = False
+    for stamp, cloud in clouds:
+        if cloud.swapped and not said:
+            said = True
+            _log.warning(
+                "%s: points aren't in the byte order that is stated: read in the other", where
+            )
+        yield Sweep(stamp, cloud.times, cloud.points)
 
 
 def _probes(sweeps: Iterator[Sweep]) -> list[Sweep]:
