@@ -14,14 +14,16 @@ _PROBES = 10  # sweeps with returns to decide from
 _MOST = 100  # sweeps to hold meanwhile
 
 
-def assemble(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Scan]:
+def assemble(clouds: Iterable[tuple[int, Cloud]], where: str, scale: float = 1.0) -> Iterator[Scan]:
     """Yield scans of stamps (ns) and clouds; `where` names the recording in the log.
+
+    `scale` is the length in metres of one unit of the clouds' coordinates.
 
     Drivers may start with clouds that are empty or have no usable times. Where the first few don't tell
     the encoding, they are passed on without times, and the next few are asked.
     """
     times = PointTimes(where)
-    sweeps = _sweeps(clouds, where)
+    sweeps = _sweeps(clouds, where, scale)
     while times.encoding is None and (probes := _probes(sweeps)):
         times.decide(probes)
         while probes:
@@ -30,7 +32,7 @@ def assemble(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Scan]:
         yield _scan(sweep, times)
 
 
-def _sweeps(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Sweep]:
+def _sweeps(clouds: Iterable[tuple[int, Cloud]], where: str, scale: float) -> Iterator[Sweep]:
     said = False
     for stamp, cloud in clouds:
         if cloud.swapped and not said:
@@ -38,7 +40,7 @@ def _sweeps(clouds: Iterable[tuple[int, Cloud]], where: str) -> Iterator[Sweep]:
             _log.warning(
                 "%s: points aren't in the byte order that is stated: read in the other", where
             )
-        yield Sweep(stamp, cloud.times, cloud.points)
+        yield Sweep(stamp, cloud.times, cloud.points if scale == 1 else scale * cloud.points)
 
 
 def _probes(sweeps: Iterator[Sweep]) -> list[Sweep]:

@@ -17,6 +17,7 @@ from lifelong_slam.sources.livox import LIVOX_TYPES, decode_livox
 from lifelong_slam.sources.pointcloud2 import Cloud, decode
 from lifelong_slam.sources.recording import Recording, open_recording
 from lifelong_slam.sources.static_frames import BASE_FRAMES, StaticFrames
+from lifelong_slam.sources.units import check_scale
 from lifelong_slam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -36,7 +37,11 @@ class BagSource:
     """
 
     def __init__(
-        self, path: str, topic: str | None = None, reference_topic: str | None = None
+        self,
+        path: str,
+        topic: str | None = None,
+        reference_topic: str | None = None,
+        scale: float = 1.0,
     ) -> None:
         """Find the topics and read the sensor's static pose.
 
@@ -44,14 +49,16 @@ class BagSource:
             path: the bag's file or folder.
             topic: a PointCloud2 (or Livox CustomMsg) topic; None takes the only one there is.
             reference_topic: Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped.
+            scale: metres in one unit of the clouds' coordinates.
 
         Raises:
-            SourceError: the path is missing or not a bag.
+            SourceError: the path is missing or not a bag, or the scale makes no sense.
             TopicError: a topic is missing, has the wrong type, or must be named.
         """
         self.path = Path(path)
         self.reference_topic = reference_topic
         self.unreadable = 0
+        self._scale = check_scale(scale)
         self._recording = open_recording(self.path)
         topics = dict(self._recording.topics)
         self.topic = _choose_topic(topics, topic, self.path)
@@ -78,7 +85,7 @@ class BagSource:
             SourceError: the clouds have no x, y, z, or not one could be decoded.
         """
         self.unreadable = 0
-        yield from assemble(self._clouds(), f"{self.path.name} {self.topic}")
+        yield from assemble(self._clouds(), f"{self.path.name} {self.topic}", self._scale)
         if self.unreadable:
             _log.warning("%s: %d unreadable messages left out", self.path, self.unreadable)
         if self.unreadable and self.unreadable == self._count:

@@ -17,6 +17,7 @@ from lifelong_slam.sources.natural_order import natural_order
 from lifelong_slam.sources.references import ordered_trajectory
 from lifelong_slam.sources.scan_files import nominal_stamps, read_scans, stamps_in_names
 from lifelong_slam.sources.text_files import read_poses, read_times
+from lifelong_slam.sources.units import check_scale
 from lifelong_slam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ class FolderSource:
         times: str | None = None,
         poses: str | None = None,
         columns: int | None = None,
+        scale: float = 1.0,
     ) -> None:
         """Find the files, and read their times and reference poses.
 
@@ -41,12 +43,15 @@ class FolderSource:
             poses: reference T_reference_sensor of each scan, KITTI 3x4 or TUM rows. TUM rows carry
                 their stamps: any number of them where scans have their own.
             columns: how many float32 a point of a .bin file has, x y z first; None finds out.
+            scale: metres in one unit of the coordinates.
 
         Raises:
-            SourceError: a path is missing, no scans are there, or counts don't match.
+            SourceError: a path is missing, no scans are there, counts don't match, or columns or
+                scale make no sense.
         """
         self.path = Path(path)
         self.files = find_scan_files(self.path)
+        self._scale = check_scale(scale)
         self._columns = self._find_columns(columns)
         self._damaged: list[str] = []
         own, rows = (None, None) if poses is None else read_poses(Path(poses))
@@ -69,7 +74,9 @@ class FolderSource:
             SourceError: not one file could be read.
         """
         read = partial(read_cloud, columns=self._columns)
-        yield from read_scans(self.files, self.stamps, read, str(self.path), self._damaged)
+        yield from read_scans(
+            self.files, self.stamps, read, str(self.path), self._damaged, self._scale
+        )
 
     @property
     def unreadable(self) -> int:

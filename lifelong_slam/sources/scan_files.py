@@ -54,14 +54,17 @@ def read_scans(
     read: Callable[[Path], Cloud],
     where: str,
     damaged: list[str],
+    scale: float = 1.0,
 ) -> Iterator[Scan]:
     """Yield the scans of the files; damaged ones are logged, listed in `damaged` and left out.
+
+    `scale` is the length in metres of one unit of the files' coordinates.
 
     Raises:
         SourceError: not one file could be read.
     """
     damaged.clear()
-    yield from assemble(_readable(files, stamps, read, damaged), where)
+    yield from assemble(_readable(files, stamps, read, damaged), where, scale)
     if damaged:
         _log.warning("%s: %d of %d files left out as damaged", where, len(damaged), len(files))
     if len(damaged) == len(files):

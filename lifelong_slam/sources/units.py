@@ -1,0 +1,81 @@
+"""Notices coordinates that can't be metres in the sensor's frame, by the ranges of the first scans."""
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
+
+import numpy as np
+
+from lifelong_slam.errors import SourceError
+from lifelong_slam.scan import Scan
+
+_log = logging.getLogger(__name__)
+
+_SCANS = 10
+_LEAST_SHARE = 0.01  # of the points; the rest is too few to register
+_NEAREST = 0.1  # metres; no LiDAR has a median range below
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "feet": 0.3048}
+
+
+def check_scale(scale: float) -> float:
+    """Return the metres in one unit of a recording's coordinates.
+
+    Raises:
+        SourceError: it isn't a positive number.
+    """
+    if not 0 < scale < np.inf:
+        raise SourceError(f"scale must be positive: metres in one unit, not {scale}")
+    return scale
+
+
+def check_units(scans: Iterable[Scan], max_range: float) -> Iterator[Scan]:
+    """Pass scans on, if the first few of them have points within `max_range` metres.
+
+    A unit can't be read off points: what lies at 500 may be in metres, seen from the air, or in
+    millimetres on a table. What the sensor's settings leave of them can. So nothing is converted without
+    being asked: an error says what other units would make of the ranges. Where most points lie beyond
+    `max_range`, but not all, a warning says the same.
+
+    Raises:
+        SourceError: hardly any point lies within the range.
+    """
+    scans = iter(scans)
+    first = list(islice(scans, _SCANS))
+    if first:
+        _check_ranges(first, max_range)
+    yield from chain(_drained(first), scans)
+
+
+def _drained(scans: list[Scan]) -> Iterator[Scan]:
+    while scans:  # so that none is held for as long as the run lasts
+        yield scans.pop(0)
+
+
+def _check_ranges(scans: Sequence[Scan], max_range: float) -> None:
+    points = np.concatenate([scan.points[scan.points.any(axis=1)] for scan in scans])
+    ranges = np.linalg.norm(points, axis=1)
+    if len(ranges) == 0 or (median := float(np.median(ranges))) <= max_range:
+        return
+    within = float(np.mean(ranges <= max_range))
+    message = (
+        f"points lie at a median range of {median:.0f} m, {100 * within:.2g} % of them within "
+        f"sensor.max_range = {max_range:g} m: {_suggestion(median, max_range)}"
+    )
+    if within < _LEAST_SHARE:
+        raise SourceError(message)
+    _log.warning("%s", message)
+
+
+def _suggestion(median: float, max_range: float) -> str:
+    """Say what would explain a median range beyond the largest one."""
+    guesses = [
+        f"{median * scale:.3g} m if they are in {unit} (scenario.scale={scale:g})"
+        for unit, scale in _UNITS.items()
+        if _NEAREST <= median * scale <= max_range
+    ]
+    if not guesses:
+        return (
+            "scans are needed in metres and in the sensor's own frame, not in that of a map (such "
+            "as UTM)"
+        )
+    return f"{', '.join(guesses)}; if they are in metres, raise sensor.max_range"
