@@ -68,7 +68,7 @@ def first_row(path: Path, kind: str) -> tuple[int, str]:
                 row = line.strip()
                 if not row or row.startswith("#"):
                     continue
-                if heading or any(map(_is_number, row.replace(",", " ").split())):
+                if heading or any(map(is_number, row.replace(",", " ").split())):
                     return number, row
                 heading = True
     except UnicodeDecodeError as error:
@@ -93,7 +93,8 @@ def check_finite(where: str, rows: Array) -> None:
         )
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number as Python reads one."""
     try:
         float(text)
     except ValueError:
