@@ -357,6 +357,15 @@ def test_columns_are_asked_for_where_nothing_tells(tmp_path):
         FolderSource(str(tmp_path), columns=2)
 
 
+@pytest.mark.parametrize("kind", ["<f8", ">f4", "<i4"])
+def test_bin_files_of_other_numbers_are_refused(tmp_path, kind):
+    for i in range(3):
+        values = np.column_stack([street(i, 2520), np.arange(2520) % 32])
+        (values * (1000 if kind == "<i4" else 1)).astype(kind).tofile(tmp_path / f"{i}.bin")
+    with pytest.raises(SourceError, match="no float32 coordinates"):
+        FolderSource(str(tmp_path))
+
+
 def test_a_damaged_file_among_those_of_five_columns(tmp_path, caplog):
     for i in range(4):
         write_layout(tmp_path / f"{i}.bin", street(i, 2520), "ir")

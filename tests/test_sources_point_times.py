@@ -265,3 +265,13 @@ def test_the_reason_without_times_is_logged_once(caplog):
     assert [scan.offsets for scan in assemble(clouds, "test")] == [None] * 35
     (record,) = caplog.records
     assert "treated as absent" in record.message
+
+
+def test_one_sweep_that_tells_does_not_decide_alone():
+    # on a clock of its own, started 1 s before: one sweep alone may be late by that
+    encode = lambda s: (s - EPOCH + 10**9 + TRUE * 1e9).astype(np.uint64)  # noqa: E731
+    real = sweeps_of("t", encode)
+    mute = [(EPOCH - (9 - i) * 10**8, Cloud(np.ones((9, 3)), {"t": np.zeros(9)})) for i in range(9)]
+    scans = list(assemble([*mute, *((s.stamp, Cloud(s.points, s.times)) for s in real)], "test"))
+    for scan in scans[-10:]:
+        np.testing.assert_allclose(scan.offsets, TRUE, atol=1e-8)

@@ -11,7 +11,7 @@ from lifelong_slam.sources.pointcloud2 import Cloud
 _log = logging.getLogger(__name__)
 
 _PROBES = 10  # sweeps with returns to decide from
-_MOST = 100  # sweeps to hold meanwhile
+_MOST = 100  # sweeps to look for them among
 
 
 def assemble(clouds: Iterable[tuple[int, Cloud]], where: str, scale: float = 1.0) -> Iterator[Scan]:
@@ -44,12 +44,14 @@ def _sweeps(clouds: Iterable[tuple[int, Cloud]], where: str, scale: float) -> It
 
 
 def _probes(sweeps: Iterator[Sweep]) -> list[Sweep]:
-    """Take the next sweeps, until enough of them have returns."""
-    probes, telling = [], 0
+    """Take the next sweeps, until there are enough with returns from the first that tells on."""
+    probes, told, count = [], False, 0
     for sweep in islice(sweeps, _MOST):
         probes.append(sweep)
-        telling += bool(sweep.returns.any())
-        if telling == _PROBES:
+        if sweep.tells and not told:
+            told, count = True, 0
+        count += bool(sweep.returns.any())
+        if count == _PROBES:
             break
     return probes
 

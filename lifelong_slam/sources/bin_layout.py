@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
+from lifelong_slam.sources.pointcloud2 import share_of_lengths
 
 _log = logging.getLogger(__name__)
 
@@ -32,12 +33,21 @@ def find_columns(files: Sequence[Path], where: str) -> int:
     """Return the number of columns of a folder's BIN files; other than KITTI's four is logged.
 
     Raises:
-        SourceError: several numbers are possible, not four, and the values tell none of them.
+        SourceError: several numbers are possible, not four, and the values tell none of them; or the
+            values aren't float32.
     """
     sizes = np.array([path.stat().st_size for path in files])
     whole = {k: float(np.mean(sizes % (4 * k) == 0)) for k in range(_FEWEST, _MOST + 1)}
     possible = [k for k, share in whole.items() if share > 0.5]  # some files may be damaged
-    columns = _most_telling(files, possible, where) if sizes.any() and possible else KITTI_COLUMNS
+    if not possible or not sizes.any():
+        return KITTI_COLUMNS
+    values = [np.fromfile(path, "<f4", _VALUES) for path in files[:: -(-len(files) // _FILES)]]
+    columns = _most_telling(values, possible, where)
+    points = [file[: len(file) // columns * columns].reshape(-1, columns)[:, :3] for file in values]
+    if share_of_lengths(np.concatenate(points).ravel()) < 0.9:
+        raise SourceError(
+            f"{where}: its BIN files hold no float32 coordinates; of other kinds, convert them first"
+        )
     if columns != KITTI_COLUMNS:
         _log.warning(
             "%s: read as float32 in %d columns, as fits sizes and values; if that is wrong, give "
@@ -47,11 +57,11 @@ def find_columns(files: Sequence[Path], where: str) -> int:
     return columns
 
 
-def _most_telling(files: Sequence[Path], possible: Sequence[int], where: str) -> int:
+def _most_telling(
+    values: Sequence[NDArray[np.float32]], possible: Sequence[int], where: str
+) -> int:
     if len(possible) == 1:
         return possible[0]
-    every = -(-len(files) // _FILES)
-    values = [np.fromfile(path, "<f4", _VALUES) for path in files[::every]]
     information = {k: _information(values, k) for k in possible}
     best = max(information.values())
     if best < _NOTHING and KITTI_COLUMNS in possible:

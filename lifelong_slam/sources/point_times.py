@@ -63,6 +63,12 @@ class Sweep:
         returns = np.isfinite(self.points).all(axis=1) & self.points.any(axis=1)
         return np.asarray(returns)
 
+    @property
+    def tells(self) -> bool:
+        """Whether a candidate field differs between returns, as times do."""
+        returns = self.returns
+        return any(_differ(_measured(values[returns])) for values in self.times.values())
+
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
@@ -178,7 +184,7 @@ def _preference(name: str) -> tuple[int, str]:
 def _find_encoding(name: str, sweeps: Sequence[Sweep]) -> Encoding | None:
     """Return the encoding that makes the median sweep plausible, or None."""
     samples = [(s.stamp, _measured(s.times[name][s.returns])) for s in sweeps]
-    samples = [(stamp, values) for stamp, values in samples if (values != values[:1]).any()]
+    samples = [(stamp, values) for stamp, values in samples if _differ(values)]
     if not samples:
         return None
     unit = _unit(samples)
@@ -192,16 +198,21 @@ def _measured(values: Values) -> Values:
     return values if values.dtype.kind in "iu" else values[:0]
 
 
+def _differ(values: Values) -> bool:
+    return bool((values != values[:1]).any())
+
+
 def _unit(samples: Sequence[tuple[int, Values]]) -> int | None:
     """Return the nanoseconds in one count, or None where no unit gives a plausible sweep."""
     stamp, values = samples[len(samples) // 2]
     middle = float(np.median(values))
-    for unit in _UNITS.values():
+    whole = np.issubdtype(values.dtype, np.integer)  # whole seconds can't time a sweep's points
+    units = list(_UNITS.values())[whole:]
+    for unit in units:
         like_stamp = abs(middle * unit - stamp) < 0.1 * stamp
         if stamp > _PRECISE_EPOCH and like_stamp:
             return unit if 0 < _span(samples, unit) < LONGEST_SWEEP else None
-    whole = np.issubdtype(values.dtype, np.integer)  # whole seconds can't time a sweep's points
-    for unit in list(_UNITS.values())[whole:]:
+    for unit in units:
         if SHORTEST_SWEEP <= _span(samples, unit) < LONGEST_SWEEP:
             return unit
     return None

@@ -64,19 +64,24 @@ def decode(message: Any) -> Cloud:
 
 def _in_other_order(records: NDArray[np.void]) -> bool:
     """Tell whether the coordinates are lengths in the other byte order only."""
-    if _share_of_lengths(records) >= 0.5:
-        return False
-    return _share_of_lengths(records.view(records.dtype.newbyteorder())) > 0.9
-
-
-def _share_of_lengths(records: NDArray[np.void]) -> float:
-    """Return the share of the coordinates, zeros and NaN aside, that any unit makes a length.
-
-    Swapped bytes give a float any exponent: about one in six is as large as a length then.
-    """
     sample = records[:, :: max(1, records.size // _SAMPLE)]
-    with np.errstate(invalid="ignore"):
-        sizes = np.abs(np.concatenate([sample[axis].ravel() for axis in "xyz"], dtype=np.float64))
+    if _share(sample) >= 0.5:
+        return False
+    return _share(sample.view(records.dtype.newbyteorder())) > 0.9
+
+
+def _share(records: NDArray[np.void]) -> float:
+    with np.errstate(invalid="ignore"):  # NaN of unusual bits
+        axes = [records[axis].ravel().astype(np.float64) for axis in "xyz"]
+    return share_of_lengths(np.concatenate(axes))
+
+
+def share_of_lengths(coordinates: NDArray[np.floating[Any]]) -> float:
+    """Return the share of (N,) coordinates, zeros and NaN aside, that some unit makes a length.
+
+    Bytes that aren't those of a float give it any exponent: one in six is as large as a length then.
+    """
+    sizes = np.abs(coordinates)
     sizes = sizes[sizes > 0]
     return float(np.mean((sizes > _SHORTEST) & (sizes < _LONGEST))) if len(sizes) else 1.0
 
