@@ -54,6 +54,13 @@ def test_good_ranges_pass_without_a_word(scale, max_range, caplog):
     assert caplog.text == ""
 
 
+def test_a_small_room_in_centimetres_is_noticed_though_the_floor_is_in_range():
+    floor = [Scan(s.stamp, np.vstack([40.0 * s.points, 2.0 * s.points[:25]])) for s in recording()]
+    assert 0 < np.mean(np.linalg.norm(floor[0].points, axis=1) < 100) < 0.1
+    with pytest.raises(SourceError, match="if they are in centimetres"):
+        next(check_units(floor, max_range=100.0))
+
+
 def test_most_points_beyond_the_range_are_a_warning(caplog):
     given = recording()
     assert list(check_units(given, max_range=15.0)) == given

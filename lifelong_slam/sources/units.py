@@ -12,7 +12,7 @@ from lifelong_slam.scan import Scan
 _log = logging.getLogger(__name__)
 
 _SCANS = 10
-_LEAST_SHARE = 0.01  # of the points; the rest is too few to register
+_LEAST_SHARE = 0.1  # of the points; a range that leaves fewer wasn't chosen for them
 _NEAREST = 0.1  # metres; no LiDAR has a median range below
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "feet": 0.3048}
 
@@ -37,7 +37,7 @@ def check_units(scans: Iterable[Scan], max_range: float) -> Iterator[Scan]:
     `max_range`, but not all, a warning says the same.
 
     Raises:
-        SourceError: hardly any point lies within the range.
+        SourceError: less than a tenth of the points lie within the range.
     """
     scans = iter(scans)
     first = list(islice(scans, _SCANS))
