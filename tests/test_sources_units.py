@@ -74,6 +74,14 @@ def test_a_recording_of_nothing_is_for_others_to_judge():
     assert list(check_units([], 100.0)) == []
 
 
+def test_scans_are_passed_on_as_they_come_once_one_has_points_in_range():
+    far, near = recording(1e3), recording()
+    given = iter([*far[:4], *near, *far])
+    checked = check_units(given, 100.0)
+    assert next(checked) is far[0]
+    assert next(given) is near[1]  # so that the first scan waits for no more than it must
+
+
 def test_a_run_ends_before_its_first_scan():
     system = KissIcpSystem(min_range=1.0, max_range=100.0, voxel_size=1.0, threads=1)
     with pytest.raises(SourceError, match="millimetres"):

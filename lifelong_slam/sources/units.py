@@ -2,9 +2,10 @@
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, islice
+from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import Scan
@@ -29,7 +30,7 @@ def check_scale(scale: float) -> float:
 
 
 def check_units(scans: Iterable[Scan], max_range: float) -> Iterator[Scan]:
-    """Pass scans on, if the first few of them have points within `max_range` metres.
+    """Pass scans on, if one of the first few has enough points within `max_range` metres.
 
     A unit can't be read off points: what lies at 500 may be in metres, seen from the air, or in
     millimetres on a table. What the sensor's settings leave of them can. So nothing is converted without
@@ -37,23 +38,31 @@ def check_units(scans: Iterable[Scan], max_range: float) -> Iterator[Scan]:
     `max_range`, but not all, a warning says the same.
 
     Raises:
-        SourceError: less than a tenth of the points lie within the range.
+        SourceError: less than a tenth of the points lie within the range, in all of the first scans.
     """
     scans = iter(scans)
-    first = list(islice(scans, _SCANS))
-    if first:
-        _check_ranges(first, max_range)
-    yield from chain(_drained(first), scans)
+    held: list[Scan] = []
+    for scan in islice(scans, _SCANS):
+        held.append(scan)
+        ranges = _ranges([scan])
+        if len(ranges) and np.mean(ranges <= max_range) >= _LEAST_SHARE:
+            break
+    else:
+        ranges = _ranges(held)
+    _check_ranges(ranges, max_range)
+    while held:
+        yield held.pop(0)
+    yield from scans
 
 
-def _drained(scans: list[Scan]) -> Iterator[Scan]:
-    while scans:  # so that none is held for as long as the run lasts
-        yield scans.pop(0)
+def _ranges(scans: Sequence[Scan]) -> NDArray[np.float64]:
+    """Return (N,) distances in metres of the points that were measured."""
+    ranges = [np.linalg.norm(scan.points, axis=1) for scan in scans]
+    together = np.concatenate([np.empty(0), *ranges])
+    return np.asarray(together[together > 0])
 
 
-def _check_ranges(scans: Sequence[Scan], max_range: float) -> None:
-    points = np.concatenate([scan.points[scan.points.any(axis=1)] for scan in scans])
-    ranges = np.linalg.norm(points, axis=1)
+def _check_ranges(ranges: NDArray[np.float64], max_range: float) -> None:
     if len(ranges) == 0 or (median := float(np.median(ranges))) <= max_range:
         return
     within = float(np.mean(ranges <= max_range))
