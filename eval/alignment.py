@@ -1,4 +1,4 @@
-"""Moves an estimate onto its reference (paper 000, section 4.1: Kabsch's algorithm).
+"""Moves an estimate onto its reference, by Kabsch's algorithm.
 
 Sources: W. Kabsch, *A solution for the best rotation to relate two sets of vectors* (1976);
 S. Umeyama, *Least-squares estimation of transformation parameters between two point patterns*
@@ -20,9 +20,13 @@ Array = NDArray[np.float64]
 Method = Literal["none", "first_pose", "se3", "yaw", "sim3"]
 
 _LINE = 0.01  # spread across a line, relative to the spread along it
+_SLIM = 0.1  # the same of a path that looks like a line
 _ROLL = 0.02  # rad; an alignment that may be off by more is worth a warning
 _FAR = 1000.0  # metres
 _STILL = 1e-6  # metres
+_MIRRORS = ((1, -1, 1), (1, 1, -1))  # of the axes; a rotation makes all others of these
+_TURNED = 90.0  # deg; nearer to upside down than to upright
+_BETTER = 0.7  # of the RMSE; noise makes no mirror image fit that much better
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +83,7 @@ def align(
         raise AlignmentError("positions that are NaN or infinite can't be aligned")
     R, t, scale = _SOLVERS[method](estimate, reference)
     found = Alignment(method, R, t, scale)
-    warnings = tuple(_warnings(found, estimate.positions_xyz, reference.positions_xyz))
+    warnings = tuple(_warnings(found, estimate, reference))
     return Alignment(method, R, t, scale, warnings)
 
 
@@ -126,11 +130,19 @@ def _se3(estimate: PoseTrajectory3D, reference: PoseTrajectory3D) -> tuple[Array
 
 
 def _sim3(estimate: PoseTrajectory3D, reference: PoseTrajectory3D) -> tuple[Array, Array, float]:
-    return kabsch(estimate.positions_xyz, reference.positions_xyz, with_scale=True)
+    return _scaled_kabsch(estimate.positions_xyz, reference.positions_xyz)
 
 
 def _yaw(estimate: PoseTrajectory3D, reference: PoseTrajectory3D) -> tuple[Array, Array, float]:
-    source, target = estimate.positions_xyz, reference.positions_xyz
+    return _turn(estimate.positions_xyz, reference.positions_xyz)
+
+
+def _scaled_kabsch(source: Array, target: Array) -> tuple[Array, Array, float]:
+    return kabsch(source, target, with_scale=True)
+
+
+def _turn(source: Array, target: Array) -> tuple[Array, Array, float]:
+    """Return R about z, t and scale 1 that minimise what `kabsch` does."""
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     a, b = source - mean_source, target - mean_target
     sine = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
@@ -147,10 +159,18 @@ _SOLVERS: dict[str, _Solver] = {
     "yaw": _yaw,
     "sim3": _sim3,
 }
+_FITS: dict[str, Callable[[Array, Array], tuple[Array, Array, float]]] = {
+    "se3": kabsch,
+    "yaw": _turn,
+    "sim3": _scaled_kabsch,
+}
 
 
-def _warnings(found: Alignment, source: Array, target: Array) -> list[str]:
-    """Say what the positions leave undetermined, and what looks like a mix of frames."""
+def _warnings(
+    found: Alignment, estimate: PoseTrajectory3D, reference: PoseTrajectory3D
+) -> list[str]:
+    """Say what the poses leave undetermined, and what looks like a mix of frames."""
+    source, target = estimate.positions_xyz, reference.positions_xyz
     warnings = []
     # The least, as a turn about the common start takes the far end of a long drive anywhere.
     moved = float(np.linalg.norm(found.move(source) - source, axis=1).min())
@@ -158,24 +178,83 @@ def _warnings(found: Alignment, source: Array, target: Array) -> list[str]:
         warnings.append(
             f"the alignment moves every pose by at least {moved / 1000:.1f} km: do the frames fit?"
         )
-    if found.method not in ("se3", "sim3", "yaw"):
+    if found.method not in _FITS:
         return warnings
-    axes = 2 if found.method == "yaw" else 3
-    centred = (target - target.mean(axis=0))[:, :axes]
-    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(target))
-    rmse = float(np.sqrt(((found.move(source) - target) ** 2).sum(axis=1).mean()))
+    spread = _spread(target, 2 if found.method == "yaw" else 3)
+    errors = _errors(found, source, target)
+    rmse = _rms(errors)
     if spread[0] <= _STILL:
-        warnings.append("the reference hardly moves: the alignment's rotation is not determined")
+        return [*warnings, "the reference hardly moves: the alignment's rotation is not determined"]
+    mirrored = _mirrored_errors(found.method, source, target)
+    if _rms(mirrored) < _BETTER * rmse:
+        cause = "left-handed or upside down" if found.method == "yaw" else "left-handed"
+        warnings.append(
+            f"a mirror image of the estimate fits: mean error {mirrored.mean():.3f} m instead of"
+            f" {errors.mean():.3f} m; is one of the two {cause}, with an axis the wrong way round?"
+        )
     elif spread[0] <= rmse:
         warnings.append(
             f"errors ({rmse:.1f} m RMSE) are as large as the path (standard deviation {spread[0]:.1f} m):"
             " the alignment's rotation is not determined"
         )
-    elif axes == 3 and spread[1] <= max(_LINE * spread[0], rmse / _ROLL):
-        open_by = np.degrees(np.arctan2(rmse, spread[1]))
-        warnings.append(
-            f"the path is nearly a straight line (standard deviations: {spread[0]:.1f} m along,"
-            f" {spread[1]:.2f} m across; errors of {rmse:.3f} m): the alignment leaves roll about it"
-            f" open by some {open_by:.1f} deg, so absolute rotation errors mean little"
-        )
+    elif len(spread) == 3 and spread[1] <= max(_LINE * spread[0], rmse / _ROLL):
+        warnings.append(_open_roll(spread, rmse))
+    if _BETTER <= (_rms(mirrored) + _STILL) / (rmse + _STILL) <= 1 / _BETTER:
+        warnings += _flat(spread, errors, mirrored, _median_turn(found, estimate, reference))
     return warnings
+
+
+def _flat(spread: Array, errors: Array, mirrored: Array, turn: float) -> list[str]:
+    """Say what a path means that its mirror image fits as well, if its poses are turned by a lot."""
+    line = len(spread) == 3 and spread[1] <= _SLIM * spread[0]  # roll alone would explain it
+    if line or turn <= _TURNED or spread[0] <= _rms(errors):
+        return []
+    return [
+        f"rotation errors are about {turn:.0f} deg, and the path is so flat that a mirror image fits as"
+        f" well (mean error {mirrored.mean():.3f} m, {errors.mean():.3f} m as it is): the estimate is"
+        " left-handed, or its poses have other axes, as with z down"
+    ]
+
+
+def _open_roll(spread: Array, rmse: float) -> str:
+    """Say by how much errors leave the rotation about the path's longest extent open."""
+    extents = f"standard deviations: {spread[0]:.1f} m along, {spread[1]:.2f} m across"
+    if spread[1] <= _SLIM * spread[0]:
+        reason = f"the path is nearly a straight line ({extents}; errors of {rmse:.3f} m)"
+    else:
+        reason = f"errors of {rmse:.3f} m are large for the path ({extents})"
+    return (
+        f"{reason}: the alignment leaves roll about {'it' if 'line' in reason else 'its long axis'}"
+        f" open by some {np.degrees(np.arctan2(rmse, spread[1])):.1f} deg, so absolute rotation errors mean"
+        " little"
+    )
+
+
+def _spread(positions: Array, axes: int) -> Array:
+    """Return the standard deviations along the principal axes in metres, the largest first."""
+    centred = (positions - positions.mean(axis=0))[:, :axes]
+    return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(positions)))
+
+
+def _errors(found: Alignment, source: Array, target: Array) -> Array:
+    return np.asarray(np.linalg.norm(found.move(source) - target, axis=1))
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+def _mirrored_errors(method: Method, source: Array, target: Array) -> Array:
+    """Return (N,) errors in metres of the mirror image that fits best."""
+    images = [source * mirror for mirror in _MIRRORS]
+    fits = [Alignment(method, *_FITS[method](image, target)) for image in images]
+    return min(map(_errors, fits, images, [target] * len(images)), key=_rms)
+
+
+def _median_turn(
+    found: Alignment, estimate: PoseTrajectory3D, reference: PoseTrajectory3D
+) -> float:
+    """Return the median angle in degrees between aligned and true orientations."""
+    wxyz = (path.orientations_quat_wxyz for path in (found.apply(estimate), reference))
+    aligned, true = (Rotation.from_quat(q, scalar_first=True) for q in wxyz)
+    return float(np.degrees(np.median((aligned.inv() * true).magnitude())))

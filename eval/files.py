@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,10 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eval.errors import FileError
+from eval.text_table import is_number
 
 Timeline = dict[str, NDArray[np.float64]]
 
 _AXES = {"VERTEX_SE3:QUAT": 3, "VERTEX_SE2": 2}  # coordinates of a vertex's position
+_FORMULA = ("=", "+", "-", "@")
+_CONTROL = re.compile(r"[\x00-\x1f]+")  # line breaks and tabs among them
 _KINDS = ("odometry", "loop", "composed")
 
 
@@ -85,6 +89,19 @@ def read_timeline(path: Path) -> Timeline:
     except ValueError as error:
         raise FileError(f"{path} is not a table of numbers: {error}") from error
     return {name: values[:, i] for i, name in enumerate(header)}
+
+
+def plain_cell(value: Any) -> Any:
+    """Return a cell for a CSV file that no spreadsheet takes for a formula, and no reader for two rows.
+
+    Text that begins as a formula does gets a quote in front, as OWASP recommends; numbers stay as they are.
+    """
+    if not isinstance(value, str):
+        return value
+    text = _CONTROL.sub(" ", value).strip()
+    if not text.startswith(_FORMULA) or is_number(text):
+        return text
+    return f"'{text}"
 
 
 def write_json(path: Path, value: Any) -> None:

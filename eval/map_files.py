@@ -17,12 +17,15 @@ from eval.nearest import Points
 _log = logging.getLogger(__name__)
 
 _NOTHING = np.zeros((0, 3), np.float32)
+_COARSE = 0.01  # m between neighbouring values of a coordinate; maps are judged by centimetres
 
 
 def read_map(path: Path) -> Points:
     """Read the (N, 3) points of a map, in metres; N may be 0.
 
-    Points with NaN or infinite coordinates are dropped, and their number is logged.
+    Points with NaN or infinite coordinates are dropped, and their number is logged. So is it where the file
+    can't hold centimetres: where single precision is too coarse so far from the origin, as with UTM
+    coordinates, or the scale of a LAS file is.
 
     Args:
         path: a PLY or PCD file, in text or binary, compressed or not, or a LAS or LAZ file.
@@ -41,13 +44,31 @@ def read_map(path: Path) -> Points:
         raise FileError(f"{path} is no map file: its name must end with {', '.join(_READERS)}")
     points = reader(path)
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
-    if finite.all():
-        return points
-    _log.warning(
-        "%s: %d of %d points dropped, which have NaN or infinite coordinates",
-        path, np.count_nonzero(~finite), len(finite),
-    )  # fmt: skip
-    return points[finite]
+    if not finite.all():
+        _log.warning(
+            "%s: %d of %d points dropped, which have NaN or infinite coordinates",
+            path, np.count_nonzero(~finite), len(finite),
+        )  # fmt: skip
+        points = points[finite]
+    if (step := _single_precision_step(points)) > _COARSE:
+        _log.warning(
+            "%s: coordinates of single precision are %.2g m apart at %.0f m from the origin, which shows as"
+            " errors: save the map in double precision, or relative to a point nearby",
+            path, step, np.abs(points).max(),
+        )  # fmt: skip
+    return points
+
+
+def _single_precision_step(points: Points) -> float:
+    """Return the metres between neighbouring values of the largest coordinate as float32; 0 if finer.
+
+    Points that came as doubles, but through a float32, are as coarse.
+    """
+    with np.errstate(over="ignore"):
+        single = points.astype(np.float32, copy=False)
+    if len(points) == 0 or not np.array_equal(single, points):
+        return 0.0
+    return float(np.spacing(np.abs(single).max()))
 
 
 def _read_ply(path: Path) -> Points:
@@ -107,10 +128,15 @@ def _read_las(path: Path) -> Points:
     try:
         with laspy.open(path) as file:
             promised, cloud = file.header.point_count, file.read()
+            step = max(file.header.scales)
     except (laspy.errors.LaspyException, LazrsError, ValueError) as error:
         raise FileError(f"{path} is not a whole LAS file: {error}") from error
     if len(cloud.points) != promised:
         raise FileError(f"{path} has {len(cloud.points)} points of the {promised} in its header")
+    if step > _COARSE:
+        _log.warning(
+            "%s: by its scale, coordinates are %.2g m apart, which shows as errors", path, step
+        )
     return np.asarray(cloud.xyz, dtype=np.float64)
 
 

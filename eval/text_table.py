@@ -1,5 +1,7 @@
 """Reads the tables of numbers that trajectories and relations come as."""
 
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,13 @@ from eval.errors import FileError
 Array = NDArray[np.float64]
 
 
-def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None) -> Array:
+def read_table(
+    path: Path,
+    kind: str,
+    columns: int,
+    delimiter: str | None = None,
+    chosen: Sequence[int] | None = None,
+) -> Array:
     """Read rows of numbers, all of them finite; `#` starts a comment, one heading may come first.
 
     Args:
@@ -18,9 +26,10 @@ def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None
         kind: what the file should be, for messages.
         columns: how many there are; with a delimiter, how many to read of maybe more.
         delimiter: between columns; without one, white space.
+        chosen: which columns to read, in this order, with a delimiter; None takes the first ones.
 
     Returns:
-        (N, columns) numbers, at least one row.
+        (N, columns) numbers, or as many as are chosen; at least one row.
 
     Raises:
         FileError: the file is missing, empty or malformed, or holds NaN.
@@ -34,7 +43,7 @@ def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None
             path,
             delimiter=delimiter,
             skiprows=skip,
-            usecols=range(columns) if delimiter else None,
+            usecols=(chosen or range(columns)) if delimiter else None,
             ndmin=2,
             encoding="utf-8-sig",
         )
@@ -59,12 +68,19 @@ def first_row(path: Path, kind: str) -> tuple[int, str]:
                 row = line.strip()
                 if not row or row.startswith("#"):
                     continue
-                if heading or any(map(_is_number, row.replace(",", " ").split())):
+                if heading or any(map(is_number, row.replace(",", " ").split())):
                     return number, row
                 heading = True
     except UnicodeDecodeError as error:
         raise FileError(f"{path} is not a {kind}: it is not text") from error
     raise FileError(f"{path} is not a {kind}: it holds no numbers")
+
+
+def heading_of(path: Path, rows: int) -> str:
+    """Return the last line that isn't empty of so many at the start of a file, or nothing."""
+    with path.open(encoding="utf-8-sig") as file:
+        lines = [line.strip() for line in islice(file, rows)]
+    return next((line for line in reversed(lines) if line), "")
 
 
 def check_finite(where: str, rows: Array) -> None:
@@ -77,7 +93,8 @@ def check_finite(where: str, rows: Array) -> None:
         )
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number as Python reads one."""
     try:
         float(text)
     except ValueError:

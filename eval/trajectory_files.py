@@ -1,4 +1,4 @@
-"""Reads trajectories: TUM, KITTI and EuRoC files, and topics of ROS 1 and ROS 2 bags and MCAP.
+"""Reads trajectories: TUM, KITTI, EuRoC and CSV files, and topics of ROS 1 and ROS 2 bags and MCAP.
 
 What a file is shows in its content, whatever its name. Trajectories are evo's types, named by their
 path. Text is read by NumPy: evo's CSV readers take ten times as long.
@@ -17,8 +17,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from eval.csv_columns import UNITS, find_columns, guess_rate
 from eval.errors import FileError
-from eval.text_table import check_finite, first_row, read_table
+from eval.text_table import check_finite, first_row, heading_of, read_table
 
 _log = logging.getLogger(__name__)
 
@@ -79,26 +80,44 @@ def read_tum(path: Path) -> PoseTrajectory3D:
     Raises:
         FileError: the file is missing or malformed, holds NaN, or its stamps run back.
     """
-    rows = read_table(path, "TUM trajectory", _TUM_COLUMNS)
-    _check_order(path, rows[:, 0])
-    return _trajectory(str(path), rows[:, 0], rows[:, 1:4], rows[:, 4:])
+    return _ordered(path, read_table(path, "TUM trajectory", _TUM_COLUMNS), UNITS["s"])
 
 
 def read_euroc(path: Path) -> PoseTrajectory3D:
-    """Read EuRoC's ground truth, ``stamp[ns],x,y,z,qw,qx,qy,qz`` a line; more columns may follow.
+    """Read a comma-separated trajectory by the names in its heading, or as EuRoC's ground truth.
+
+    EuRoC has ``stamp[ns],x,y,z,qw,qx,qy,qz`` a line; more columns may follow. Whole stamps that come too
+    close for nanoseconds are taken for seconds, and the rows for TUM's then, with qw last.
 
     Raises:
         FileError: the file is missing or malformed, holds NaN, or its stamps run back.
     """
-    rows = read_table(path, "EuRoC trajectory", _EUROC_COLUMNS, delimiter=",")
+    skip, _ = first_row(path, "EuRoC trajectory")
+    if named := find_columns(heading_of(path, skip)):
+        count = max(named.indices) + 1
+        rows = read_table(path, "CSV trajectory", count, ",", named.indices)
+        return _ordered(path, rows, named.rate or guess_rate(rows[:, 0]))
+    rows = read_table(path, "EuRoC trajectory", _EUROC_COLUMNS, ",")
     if (rows[:, 0] % 1 != 0).any():
         raise FileError(
             f"{path} is not a EuRoC trajectory: its stamps are whole nanoseconds, and w leads its"
             " quaternions; TUM's seconds and quaternions are separated by spaces"
         )
-    stamps = rows[:, 0] / _NANOSECONDS
+    rate = guess_rate(rows[:, 0])
+    if rate == UNITS["s"]:
+        _log.warning(
+            "%s: stamps taken for seconds, and quaternions for qx qy qz qw as in TUM", path
+        )
+    else:
+        rows[:, 4:] = np.roll(rows[:, 4:], -1, axis=1)
+    return _ordered(path, rows, rate)
+
+
+def _ordered(path: Path, rows: Array, rate: int) -> PoseTrajectory3D:
+    """Make a trajectory of ``stamp x y z qx qy qz qw`` rows; `rate` counts of a stamp are a second."""
+    stamps = rows[:, 0] / rate
     _check_order(path, stamps)
-    return _trajectory(str(path), stamps, rows[:, 1:4], np.roll(rows[:, 4:], -1, axis=1))
+    return _trajectory(str(path), stamps, rows[:, 1:4], rows[:, 4:])
 
 
 def read_kitti(path: Path) -> PosePath3D:

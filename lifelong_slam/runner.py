@@ -23,6 +23,7 @@ from lifelong_slam.result import GraphSnapshot, SlamResult, StageTimes
 from lifelong_slam.scan import Scan
 from lifelong_slam.sources.cleaning import InputCounts, clean
 from lifelong_slam.sources.source import Source
+from lifelong_slam.sources.units import check_units
 from lifelong_slam.systems.system import System
 from lifelong_slam.timeline import Timeline, TimelineRow
 from lifelong_slam.viewer import Viewer
@@ -140,6 +141,7 @@ def run(
     observers: Sequence[Observer] = (),
     stop: StopRequest | None = None,
     info: dict[str, Any] | None = None,
+    max_range: float | None = None,
 ) -> RunRecord:
     """Feed every usable scan of a source to a system.
 
@@ -149,14 +151,19 @@ def run(
         observers: told of every scan that was processed.
         stop: ends the run early when it is requested.
         info: facts about the run to keep in its record.
+        max_range: metres from the sensor up to which the system uses points; None doesn't check
+            the units of the scans by it.
 
     Raises:
-        SourceError: the recording can't be read, or holds no usable scan.
+        SourceError: the recording can't be read, holds no usable scan, or isn't in metres.
     """
     stop = stop or StopRequest()
     counts = InputCounts()
+    scans = clean(source, counts)
+    if max_range is not None:
+        scans = check_units(scans, max_range)
     with ResourceMonitor() as monitor:
-        timeline = _feed(clean(source, counts), system, observers, stop, monitor)
+        timeline = _feed(scans, system, observers, stop, monitor)
         interrupted = stop.requested
         _log.info("input: %s", counts.summary())
         result = system.finish()

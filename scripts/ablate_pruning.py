@@ -51,7 +51,7 @@ from ablation_jobs import Job, run_all
 from command import CONF, plain, run_command
 from eval.ablation import LAW, UNPRUNED, Run, rows, summarise
 from eval.ablation_plots import PANELS, overview, save, single
-from eval.files import atomic_path, write_json
+from eval.files import atomic_path, plain_cell, write_json
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.overrides import compose_checked
 from lifelong_slam.provenance import describe_run
@@ -215,7 +215,7 @@ def report(plan: Plan, arguments: Sequence[str]) -> list[dict[str, Any]]:
         table = rows(runs)
         writer = csv.DictWriter(file, table[0].keys(), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(table)
+        writer.writerows({key: plain_cell(cell) for key, cell in row.items()} for row in table)
     write_json(
         plan.out / "ablation.json",
         {

@@ -9,7 +9,7 @@
 Prints what was found; less or more is better as the table says. Settings, with their defaults in
 conf/evaluate.yaml and conf/eval:
 
-    estimate=FILE         estimated trajectory: TUM, KITTI, EuRoC csv; ROS 1 or 2 bag or MCAP
+    estimate=FILE         estimated trajectory: TUM, KITTI, csv as EuRoC's or by its heading; bag or MCAP
     reference=FILE        trajectory to trust, of any of these kinds
     topic=T               of the estimate, where it is a bag with several topics of poses or odometry
     reference_topic=T     of the reference

@@ -72,13 +72,14 @@ def slam(config: DictConfig, folder: Path) -> RunRecord:
     with stop_on_signals() as stop:
         seed_everything(check_value("seed", config.seed, int))
         settings = make_settings(plain(part(config, "eval")))
+        max_range = check_value("sensor.max_range", part(config, "sensor").max_range, float)
         system = build(part(config, "system"))  # before recording a scenario, which takes a while
         source = build(part(config, "scenario"))
         viewer = build(part(config, "viewer"))
         observers = [] if isinstance(viewer, StubViewer) else [ViewerObserver(viewer, system)]
         try:
             with map_session(config, system, source), scan_progress(len(source)) as progress:
-                record = run(source, system, [progress, *observers], stop)
+                record = run(source, system, [progress, *observers], stop, max_range=max_range)
         finally:
             viewer.close()
         write_run(folder, record, source.reference(), source.T_base_sensor)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from eval.comparison import published
 from eval.comparison.maps import compare_maps, run_map_alignment
-from eval.comparison.runs import Run, find_runs, read_run
+from eval.comparison.runs import Missing, Run, find_runs, read_run
 from eval.comparison.table import Cell, Column, Table
 from eval.comparison.tables import make_tables
 from eval.comparison.writing import latex, markdown, write_tables
@@ -404,6 +404,30 @@ def test_csv_has_numbers(tmp_path, campaign):
     rows = list(csv.DictReader(StringIO((tmp_path / "out" / "table_5_1.csv").read_text())))
     assert float(rows[0]["velodyne MAE [m] ours"]) == 0.2
     assert rows[1]["bosch MAE [m] ours"] == ""
+
+
+HOSTILE = ["=1+1", "+1+1", "-1+cmd|' /C calc'!A0", "@SUM(A1)", "\t=1", "\r\n=1"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_cell_of_a_csv_is_a_formula(tmp_path, text):
+    columns = (Column((text, "[m]")), Column(("difference [m]",)))
+    table = Table("t", "T", (), (text, "run"), columns, {(text, "-0.3"): [Cell(-0.3), Cell(2.0)]})
+    write_tables(tmp_path, [table], [])
+    with (tmp_path / "t.csv").open(newline="") as file:
+        heading, row = list(csv.reader(file))
+    assert heading == [f"'{text.strip()}", "run", f"'{text.strip()} [m]", "difference [m]"]
+    assert row == [f"'{text.strip()}", "-0.3", "-0.3", "2.0"]
+
+
+@pytest.mark.parametrize("text", ["<img src=x onerror=alert(1)>", "<b>a</b> & b", "a\n<script>"])
+def test_markdown_has_no_html_of_others(text):
+    table = Table(text, text, (text,), (text,), (Column((text,)),), {(text,): [Cell(1.0)]})
+    written = markdown([table], [Missing(text, text)])
+    assert "<" not in written
+    rows = [line for line in written.splitlines() if line.startswith("|")]
+    assert len(rows) == 3
+    assert written.count("&lt;") == 7 * text.count("<")
 
 
 def test_a_setting_may_refer_to_what_is_not_there(tmp_path):

@@ -1,5 +1,7 @@
 """Association and alignment of trajectories."""
 
+import re
+
 import numpy as np
 import pytest
 from eval_support import disturbed, make, values_of, winding
@@ -239,3 +241,93 @@ def test_what_is_no_number_is_never_aligned(value, method):
 def test_a_good_run_has_no_warnings():
     reference = winding()
     assert compare_trajectories(disturbed(reference), reference).warnings == ()
+
+
+# mirror images, and paths in or near a plane
+
+
+def circle(height=0.2, count=400):
+    """A circle of 20 m, with so much up and down."""
+    angle = np.linspace(0, 2 * np.pi, count)
+    up = height * np.sin(3 * angle)
+    positions = np.column_stack([20 * np.cos(angle), 20 * np.sin(angle), up])
+    return make(positions, Rotation.from_euler("z", angle[:, None] + np.pi / 2))
+
+
+def mirrored(path, axis):
+    """The same path in a left-handed frame, in which one axis points the other way."""
+    flip = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+    R = Rotation.from_quat(path.orientations_quat_wxyz, scalar_first=True).as_matrix()
+    rotations = Rotation.from_matrix(flip @ R @ flip)
+    return make(path.positions_xyz @ flip, rotations, path.timestamps)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("method", ["se3", "sim3", "yaw"])
+def test_a_left_handed_estimate_is_called_so_with_how_well_its_mirror_image_fits(axis, method):
+    reference = circle()
+    estimate = mirrored(disturbed(reference, size=0.03) if method != "yaw" else reference, axis)
+    warnings = compare_trajectories(estimate, reference, method).alignment.warnings
+    (warning,) = warnings
+    assert "a mirror image of the estimate fits: mean error 0.0" in warning
+    assert "left-handed" in warning
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_in_a_plane_left_handed_and_upside_down_are_the_same(noise):
+    reference = circle(height=0.0)
+    down = Rotation.from_euler("x", np.pi)
+    own = Rotation.from_quat(reference.orientations_quat_wxyz, scalar_first=True)
+    upside_down = make(down.apply(reference.positions_xyz), down * own * down.inv())
+    shaken = np.random.default_rng(0).normal(size=(400, 3)) * noise
+    for estimate in (mirrored(reference, 1), upside_down):
+        estimate = make(
+            estimate.positions_xyz + shaken,
+            Rotation.from_quat(estimate.orientations_quat_wxyz, scalar_first=True),
+        )
+        (warning,) = compare_trajectories(estimate, reference).alignment.warnings
+        assert "rotation errors are about 180 deg" in warning
+        assert "left-handed, or its poses have other axes" in warning
+
+
+@pytest.mark.parametrize("height", [0.0, 0.2])
+def test_a_good_estimate_of_a_flat_path_has_no_warnings(height):
+    reference = circle(height)
+    assert compare_trajectories(disturbed(reference), reference).alignment.warnings == ()
+
+
+def test_large_errors_on_a_round_path_are_no_straight_line():
+    reference = circle()
+    estimate = disturbed(reference, size=0.5)
+    (warning,) = compare_trajectories(estimate, reference).alignment.warnings
+    assert "straight line" not in warning
+    assert re.search(
+        r"errors of 0\.\d+ m are large .* leaves roll .* open by some \d\.\d deg", warning
+    )
+
+
+def test_errors_as_large_as_a_paths_width_leave_roll_open():
+    # 2 m wide and 100 m long is no line, but errors of 1 m let it roll
+    along = np.linspace(-170, 170, 300)
+    reference = make(np.column_stack([along, 3 * np.sin(along / 10), 0 * along]))
+    assert compare_trajectories(disturbed(reference, size=0.001), reference).warnings == ()
+    (warning,) = compare_trajectories(disturbed(reference, size=0.5), reference).warnings
+    assert "leaves roll" in warning
+
+
+# association: what the limits include
+
+
+def test_a_gap_of_exactly_the_limit_is_interpolated():
+    reference = make(np.eye(4, 3), stamps=[0.0, 0.25, 0.5, 0.75])
+    pairs = associate(make(np.zeros((3, 3)), stamps=[0.125, 0.375, 0.625]), reference, 0.25)
+    assert (pairs.estimate.num_poses, pairs.in_gaps) == (3, 0)
+
+
+def test_stamps_that_rounding_puts_outside_take_the_end_poses():
+    reference = make(np.arange(12).reshape(4, 3), stamps=[0.0, 0.1, 0.2, 0.3])
+    estimate = make(np.zeros((4, 3)), stamps=[-5e-7, 0.1, 0.2, 0.3 + 5e-7])
+    pairs = associate(estimate, reference)
+    assert pairs.outside == 0
+    np.testing.assert_array_equal(pairs.reference.positions_xyz, reference.positions_xyz)
+    assert pairs.coverage == 1.0

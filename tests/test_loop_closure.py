@@ -290,6 +290,21 @@ def test_a_drive_where_nothing_is_seen_is_recognised_nowhere():
     assert drive.tried == 0
 
 
+def test_a_look_without_result_is_repeated_after_a_while_only(monkeypatch):
+    drive, looks = Drive(closer()), []
+    locate = drive.closer.places.locate
+
+    def counted(*arguments):
+        looks.append(drive.travelled)
+        return locate(*arguments)
+
+    monkeypatch.setattr(drive.closer.places, "locate", counted)
+    for x in np.arange(0.0, 240.0, 2.0):
+        drive.go(planar(x, 0))
+    assert len(looks) >= 4
+    assert np.diff(looks, prepend=0.0).min() >= 40.0
+
+
 def test_an_earlier_session_is_old_at_once(place):
     T = planar(0, 0, 0, 1.8)
     points = view(place, T)

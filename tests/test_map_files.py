@@ -83,6 +83,38 @@ def test_las_keeps_the_millimetres_of_utm_coordinates(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
+@pytest.mark.parametrize("lost", ["in the file", "before"])
+def test_single_precision_far_from_the_origin_is_said_with_its_step(tmp_path, caplog, name, lost):
+    points = (cloud() + UTM).astype(np.float32)
+    saved = points if lost == "in the file" else points.astype(np.float64)
+    np.testing.assert_array_equal(read_map(write(tmp_path / name, saved)), points)
+    assert "coordinates of single precision are 0.5 m apart at 5400" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["map.ply", "map.pcd", "map.las"])
+def test_double_precision_far_from_the_origin_is_fine(tmp_path, caplog, name):
+    read_map(write(tmp_path / name, cloud(dtype=np.float64) + UTM))
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize("shift", [0.0, 5_000.0, 50_000.0])
+def test_single_precision_that_holds_centimetres_is_fine(tmp_path, caplog, shift):
+    read_map(write(tmp_path / "map.ply", cloud() + np.float32(shift)))
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize(("scale", "said"), [(0.001, False), (0.01, False), (0.5, True)])
+def test_a_coarse_scale_of_a_las_file_is_said(tmp_path, caplog, scale, said):
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales = [0.001, 0.001, scale]
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud(dtype=np.float64).T
+    las.write(tmp_path / "map.las")
+    read_map(tmp_path / "map.las")
+    assert ("coordinates are 0.5 m apart" in caplog.text) == said
+
+
+@pytest.mark.parametrize("name", ["map.ply", "map.pcd"])
 def test_points_with_nan_are_dropped_and_counted(tmp_path, caplog, name):
     points = cloud(100)
     points[7, 1] = np.nan

@@ -82,3 +82,47 @@ def test_undefined_datatype_is_refused():
     message.fields[0].datatype = 77
     with pytest.raises(ValueError, match="datatype"):
         decode(message)
+
+
+def lengths(kind, count=500):
+    """Columns of a street scene: ranges of 1 to 80 m."""
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(count, 3))
+    points = directions / np.linalg.norm(directions, axis=1)[:, None]
+    points *= np.geomspace(1, 80, count)[:, None]
+    return dict(zip("xyz", points.T.astype(kind), strict=True))
+
+
+@pytest.mark.parametrize("big_endian", [True, False])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("missing", [0.0, np.nan, None])
+def test_a_wrong_byte_order_is_noticed(big_endian, kind, scale, missing):
+    columns = {name: values * kind(scale) for name, values in lengths(kind).items()}
+    columns["t"] = np.arange(500, dtype=np.uint32) * 200_000
+    if missing is not None:
+        for axis in "xyz":
+            columns[axis][100:] = missing  # points without return
+    message = cloud_message(columns, big_endian=big_endian)
+    truth = decode(message)
+    assert not truth.swapped
+    message.is_bigendian = not big_endian
+    cloud = decode(message)
+    assert cloud.swapped
+    np.testing.assert_array_equal(cloud.points, truth.points)
+    np.testing.assert_array_equal(cloud.times["t"], columns["t"])
+
+
+@pytest.mark.parametrize("rows", [1, 50])
+def test_coordinates_of_few_bits_are_judged_as_well(rows):
+    columns = {n: np.round(v * 256) / np.float32(256) for n, v in lengths(np.float32).items()}
+    message = cloud_message(columns, height=rows)
+    assert not decode(message).swapped
+    message.is_bigendian = True
+    assert decode(message).swapped
+
+
+def test_a_message_as_its_constructor_left_it_is_an_empty_cloud():
+    message = cloud_message({name: values[:0] for name, values in xyz().items()})
+    message.fields, message.height, message.point_step = [], 0, 0
+    assert decode(message).points.shape == (0, 3)

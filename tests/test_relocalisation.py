@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from lifelong_slam.loop_closure.relocalisation import (
     upright,
 )
 from lifelong_slam.mapping.static_map import thin
-from lifelong_slam.registration import Registration
+from lifelong_slam.registration import Cloud, Registration
 from lifelong_slam.sources.folder import FolderSource
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -121,6 +122,15 @@ def test_candidates_are_few_and_the_likeliest_comes_first(mapped):
     inliers = [candidate.inliers for candidate in candidates]
     assert 1 <= len(candidates) <= 5
     assert inliers == sorted(inliers, reverse=True)
+
+
+def test_of_the_places_that_a_query_fits_the_best_supported_comes_first(mapped):
+    world, relocaliser, poses = mapped
+    session, _ = visit(world, np.arange(-20.0, 23.0, 2.0), 1.0, seed=2)
+    found = [relocaliser.locate(query, range(len(poses))) for query in local_maps(session)]
+    supports = [[at.registration.support for at in locations] for locations in found]
+    assert any(len(set(several)) > 1 for several in supports)
+    assert supports == [sorted(several, reverse=True) for several in supports]
 
 
 def test_a_place_that_is_not_among_those_asked_for_is_not_found(mapped):
@@ -275,6 +285,21 @@ def test_upright_finds_the_ground_under_a_tilted_sensor(tilt):
     up = upright(tilted, VOXEL)[2, :3]
     true_up = exp(np.array([*tilt, 0, 0, 0, 0.0]))[2, :3]
     assert np.arccos(np.clip(up @ true_up, -1, 1)) < 0.01
+
+
+def test_upright_does_not_depend_on_the_side_that_normals_point_to(monkeypatch):
+    world = World([ground(60), box((12, 3, 0), (6, 8, 7)), box((-9, -6, 0), (4, 4, 5), 0.5)])
+    T = planar(0, 0, 0.3, 1.8)
+    points = transform(
+        invert(exp(np.array([0.3, 0.1, 0, 0, 0, 0]))), LIDAR.sweep(world, T, T).points
+    )
+    expected = upright(points, VOXEL)
+    prepared = Cloud.prepare(points, VOXEL)
+    for side in (-1.0, 1.0):  # all down, all up
+        normals = side * np.where(prepared.normals[:, 2:] < 0, -1, 1) * prepared.normals
+        turned = SimpleNamespace(normals=normals)
+        monkeypatch.setattr(Cloud, "prepare", lambda *_, turned=turned: turned)
+        np.testing.assert_allclose(upright(points, VOXEL), expected, atol=1e-12)
 
 
 def recorded(session, T_begin_again):

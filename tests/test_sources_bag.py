@@ -289,3 +289,12 @@ def test_without_times_the_log_says_so(tmp_path, caplog):
 def test_stores_are_what_the_writers_use():
     assert CLOUD in ROS1.fielddefs
     assert CLOUD in ROS2.fielddefs
+
+
+def test_a_wrong_byte_order_is_said_once(tmp_path, caplog):
+    messages = sweeps("db3")
+    for *_, message in messages:
+        message.is_bigendian = True
+    scans = list(BagSource(str(write_bag(tmp_path, "db3", messages))))
+    assert_same(scans, BagSource(str(write_bag(tmp_path, "db3", sweeps("db3"), "right"))))
+    assert len([r for r in caplog.records if "byte order" in r.message]) == 1

@@ -282,3 +282,143 @@ def test_noise_instead_of_files(tmp_path, caplog):
     with pytest.raises(SourceError, match="not one of its 3 scan files can be read"):
         list(FolderSource(str(tmp_path)))
     assert caplog.text.count("scan left out") == 3
+
+
+# BIN files of other layouts, and stamps in names
+
+
+def street(index, count=3000):
+    """(N, 3) points: ground and walls around a LiDAR that rings sweep in turn."""
+    rng = np.random.default_rng(index)
+    azimuth, elevation = np.linspace(-np.pi, np.pi, count), np.radians(np.arange(count) % 32 - 20)
+    ranges = np.minimum(1.8 / np.maximum(np.sin(-elevation), 1e-3), rng.uniform(5, 60, count))
+    level = ranges * np.cos(elevation)
+    xyz = [level * np.cos(azimuth), level * np.sin(azimuth), ranges * np.sin(elevation)]
+    return np.column_stack(xyz).astype(np.float32)
+
+
+def columns_of(kind, count, rng):
+    ring = np.arange(count) % 32
+    values = {
+        "i": rng.integers(0, 200, count),  # intensity
+        "u": rng.uniform(0, 1, count),  # the same as a share
+        "r": ring,
+        "t": np.linspace(0, 0.1, count),
+        "n": rng.normal(size=count),  # of a normal
+        "0": np.zeros(count),
+        "1": np.ones(count),
+    }
+    return values[kind]
+
+
+def write_layout(path, points, kinds):
+    rng = np.random.default_rng(0)
+    more = [columns_of(kind, len(points), rng) for kind in kinds]
+    np.column_stack([points, *more]).astype("<f4").tofile(path)
+
+
+@pytest.mark.parametrize(
+    "kinds", ["", "i", "u", "0", "ir", "ur", "0r", "irt", "nnn", "irt0", "innnu", "1i000", "irtui"]
+)
+@pytest.mark.parametrize("order", ["as swept", "shuffled"])
+def test_the_columns_of_bin_files_are_found(tmp_path, kinds, order):
+    # 2520 points divide by every number of columns up to ten
+    expected = [street(i, 2520) for i in range(3)]
+    for i, points in enumerate(expected):
+        if order == "shuffled":
+            np.random.default_rng(i).shuffle(points)
+        write_layout(tmp_path / f"{i}.bin", points, kinds)
+    for scan, points in zip(FolderSource(str(tmp_path)), expected, strict=True):
+        np.testing.assert_array_equal(scan.points, points)
+
+
+def test_other_than_four_columns_are_said_once(tmp_path, caplog):
+    for i in range(3):
+        write_layout(tmp_path / f"{i}.bin", street(i, 2520), "ir")
+    list(FolderSource(str(tmp_path)))
+    assert len([r for r in caplog.records if "float32 in 5 columns" in r.message]) == 1
+    caplog.clear()
+    list(FolderSource(str(tmp_path), columns=5))
+    assert "float32" not in caplog.text
+
+
+def test_sizes_tell_where_values_do_not(tmp_path):
+    for i in range(5):
+        np.ones((31 + 2 * i, 5), np.float32).tofile(tmp_path / f"{i}.bin")
+    assert [len(scan.points) for scan in FolderSource(str(tmp_path))] == [31, 33, 35, 37, 39]
+
+
+def test_columns_are_asked_for_where_nothing_tells(tmp_path):
+    for i in range(3):
+        np.ones((21, 10), np.float32).tofile(tmp_path / f"{i}.bin")  # or 3, 5, 6, 7 columns
+    with pytest.raises(SourceError, match=r"may have 3, 5, 6, 7, 10 columns.*scenario\.columns"):
+        FolderSource(str(tmp_path))
+    with pytest.raises(SourceError, match="at least 3"):
+        FolderSource(str(tmp_path), columns=2)
+
+
+@pytest.mark.parametrize("kind", ["<f8", ">f4", "<i4"])
+def test_bin_files_of_other_numbers_are_refused(tmp_path, kind):
+    for i in range(3):
+        values = np.column_stack([street(i, 2520), np.arange(2520) % 32])
+        (values * (1000 if kind == "<i4" else 1)).astype(kind).tofile(tmp_path / f"{i}.bin")
+    with pytest.raises(SourceError, match="no float32 coordinates"):
+        FolderSource(str(tmp_path))
+
+
+def test_a_damaged_file_among_those_of_five_columns(tmp_path, caplog):
+    for i in range(4):
+        write_layout(tmp_path / f"{i}.bin", street(i, 2520), "ir")
+    path = tmp_path / "2.bin"
+    path.write_bytes(path.read_bytes()[:-8])
+    assert [scan.stamp for scan in FolderSource(str(tmp_path))] == [0, 100_000_000, 300_000_000]
+    assert "whole points of 5 float32 columns" in caplog.text
+
+
+FIRST = 1_533_202_202_399_496_123
+
+
+@pytest.mark.parametrize(
+    ("name", "step"),
+    [
+        (lambda ns: f"n015__LIDAR_TOP__{ns // 1000}.pcd", 1000),
+        (lambda ns: f"{ns}.pcd", 1),
+        (lambda ns: f"scan-{ns // 10**6}.pcd", 10**6),
+        (lambda ns: f"{ns // 10**9}.{ns % 10**9:09d}.pcd", 1),
+        (lambda ns: f"{ns // 10**9}_{ns % 10**9 // 1000:06d}.pcd", 1000),
+    ],
+)
+def test_stamps_in_names(tmp_path, name, step):
+    true = [FIRST + i * 99_999_999 for i in range(4)]
+    for i, stamp in enumerate(true):
+        write_cloud(tmp_path / name(stamp), points(i))
+    source = FolderSource(str(tmp_path))
+    assert [scan.stamp for scan in source] == [stamp // step * step for stamp in true]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1533202202399496", "2"],
+        ["a_1533202202399496", "b_1533202202299496"],  # in order of another number
+        ["20180802093002", "20180802093003"],
+        ["0000000001", "0000000002"],
+    ],
+)
+def test_other_numbers_are_no_stamps(tmp_path, names, caplog):
+    for i, name in enumerate(names):
+        write_cloud(tmp_path / f"{name}.pcd", points(i))
+    assert FolderSource(str(tmp_path)).stamps.tolist() == [0, 100_000_000]
+    assert "nominal" in caplog.text
+
+
+def test_tum_poses_of_any_number_beside_stamps_in_names(tmp_path):
+    (tmp_path / "scans").mkdir()
+    stamps = FIRST // 1000 * 1000 + np.arange(3) * 10**8
+    for i, stamp in enumerate(stamps):
+        write_cloud(tmp_path / "scans" / f"{stamp // 1000}.pcd", points(i))
+    given = Trajectory(stamps[0] + np.arange(20) * 10**7, poses(20))
+    write_tum(tmp_path / "poses.txt", given)
+    source = FolderSource(str(tmp_path / "scans"), None, str(tmp_path / "poses.txt"))
+    np.testing.assert_array_equal(source.stamps, stamps)
+    np.testing.assert_array_equal(source.reference().stamps, given.stamps)

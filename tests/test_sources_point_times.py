@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lifelong_slam.sources.assembly import assemble
 from lifelong_slam.sources.point_times import PointTimes, Sweep, is_time_field
+from lifelong_slam.sources.pointcloud2 import Cloud
 
 EPOCH = 1_700_000_000_123_456_789
 TRUE = np.linspace(0.0, 0.0995, 200)
@@ -153,3 +155,123 @@ def test_names():
         assert is_time_field(name)
     for name in ("x", "intensity", "ring", "tag", "reflectivity", "line", "ambient", "rgb"):
         assert not is_time_field(name)
+
+
+# What a 32-bit counter makes of times before zero, in its own width or copied to another.
+WRAPPED = {
+    "uint32 ns": (1e9, np.uint32),
+    "uint32 us": (1e6, np.uint32),
+    "uint64 of uint32 ns": (1e9, np.uint64),
+    "int64 of uint32 ns": (1e9, np.int64),
+    "float64 of uint32 ns": (1e9, np.float64),
+    "float32 of uint32 ns": (1e9, np.float32),
+}
+
+
+def wrapped(true, rate, kind):
+    return (np.round(true * rate).astype(np.int64) % 2**32).astype(kind)
+
+
+@pytest.mark.parametrize("late", [0.02, 0.06, 0.1])  # 0.1: the header is later than all points
+@pytest.mark.parametrize("counter", WRAPPED)
+def test_times_before_the_header_in_a_counter_without_a_sign(counter, late):
+    rate, kind = WRAPPED[counter]
+    encode = lambda s: wrapped(TRUE - late, rate, kind)  # noqa: E731
+    for offsets in decoded(sweeps_of("t", encode)):
+        np.testing.assert_allclose(offsets, TRUE - late, atol=2e-6)
+
+
+def test_wrapped_nanoseconds_as_seconds():
+    encode = lambda s: wrapped(TRUE - 0.02, 1e9, np.float64) * 1e-9  # noqa: E731
+    for offsets in decoded(sweeps_of("time", encode)):
+        np.testing.assert_allclose(offsets, TRUE - 0.02, atol=1e-8)
+
+
+def test_negative_64_bit_counts_without_a_sign():
+    encode = lambda s: ((TRUE - 0.02) * 1e9).astype(np.int64).astype(np.uint64)  # noqa: E731
+    for offsets in decoded(sweeps_of("t", encode)):
+        np.testing.assert_allclose(offsets, TRUE - 0.02, atol=1e-8)
+
+
+def test_headers_that_are_late_now_and_then():
+    sweeps = sweeps_of("t", lambda s: wrapped(TRUE, 1e9, np.uint32))
+    for sweep in sweeps[5::6]:
+        sweep.times["t"][:] = wrapped(TRUE - 0.06, 1e9, np.uint32)
+    for i, offsets in enumerate(decoded(sweeps)):
+        np.testing.assert_allclose(offsets, TRUE - 0.06 * (i % 6 == 5), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", [np.uint32, np.int32])
+def test_a_free_counter_that_overflows_within_a_sweep(kind):
+    top = 2**32 if kind is np.uint32 else 2**31
+    start = top - 250_000_000  # within the third sweep
+    encode = lambda s: (  # noqa: E731
+        (start + s - EPOCH + (TRUE * 1e9).astype(np.int64)).astype(np.uint32).astype(kind)
+    )
+    for offsets in decoded(sweeps_of("t", encode)):
+        np.testing.assert_allclose(offsets, TRUE, atol=1e-8)
+
+
+@given(
+    unit=st.sampled_from([("ns", 1e9), ("us", 1e6)]),
+    duration=st.floats(0.01, 1.0),
+    shift=st.floats(-1.0, 0.0),
+)
+def test_any_wrapped_sweep(unit, duration, shift):
+    true = np.linspace(0, duration, 100) + shift * duration
+    sweeps = [
+        Sweep(EPOCH + i * 10**8, {"t": wrapped(true, unit[1], np.uint32)}, np.ones((100, 3)))
+        for i in range(3)
+    ]
+    np.testing.assert_allclose(decoded(sweeps)[0], true, atol=1.01 / unit[1])
+
+
+# Sweeps that tell nothing, as drivers send them before the first real one.
+STARTS = {
+    "empty": (np.zeros((0, 3)), lambda v: v[:0]),
+    "one point": (np.ones((1, 3)), lambda v: v[:1]),
+    "no returns": (np.zeros((200, 3)), lambda v: v),
+    "all NaN": (np.full((200, 3), np.nan), lambda v: v),
+    "constant times": (np.ones((200, 3)), np.zeros_like),
+    "no times": (np.ones((200, 3)), None),
+}
+ENCODINGS = [
+    *(DRIVERS[name][:2] for name in DRIVERS if name != "float64 ms"),
+    ("t", lambda s: wrapped(TRUE - 0.02, 1e9, np.uint32)),
+    ("time", lambda s: TRUE - 0.1),
+    ("timestamp", lambda s: (s - 10**8) / 1e9 + TRUE),
+]
+
+
+@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("number", range(len(ENCODINGS)))
+def test_sweeps_that_tell_nothing_come_first(start, number):
+    field, encode = ENCODINGS[number]
+    real = sweeps_of(field, encode)
+    expected = decoded(real)
+    points, cut = STARTS[start]
+    mute = [
+        (stamp, Cloud(points, {field: cut(encode(stamp))} if cut else {}))
+        for stamp in (EPOCH - (i + 1) * 10**8 for i in reversed(range(32)))
+    ]
+    scans = list(assemble([*mute, *((s.stamp, Cloud(s.points, s.times)) for s in real)], "test"))
+    assert len(scans) == 42
+    for scan, offsets in zip(scans[-10:], expected, strict=True):
+        np.testing.assert_array_equal(scan.offsets, offsets)
+
+
+def test_the_reason_without_times_is_logged_once(caplog):
+    clouds = [(EPOCH + i * 10**8, Cloud(np.ones((5, 3)), {"t": np.zeros(5)})) for i in range(35)]
+    assert [scan.offsets for scan in assemble(clouds, "test")] == [None] * 35
+    (record,) = caplog.records
+    assert "treated as absent" in record.message
+
+
+def test_one_sweep_that_tells_does_not_decide_alone():
+    # on a clock of its own, started 1 s before: one sweep alone may be late by that
+    encode = lambda s: (s - EPOCH + 10**9 + TRUE * 1e9).astype(np.uint64)  # noqa: E731
+    real = sweeps_of("t", encode)
+    mute = [(EPOCH - (9 - i) * 10**8, Cloud(np.ones((9, 3)), {"t": np.zeros(9)})) for i in range(9)]
+    scans = list(assemble([*mute, *((s.stamp, Cloud(s.points, s.times)) for s in real)], "test"))
+    for scan in scans[-10:]:
+        np.testing.assert_allclose(scan.offsets, TRUE, atol=1e-8)

@@ -325,3 +325,83 @@ def test_damaged_bags_are_named(tmp_path, path):
         read_trajectory(cut)
     with pytest.raises(FileError, match="can't be read as a bag"):
         read_trajectory(tmp_path)  # a folder without a bag
+
+
+# comma-separated
+
+START = 1_700_000_000
+
+
+def csv_of(path, heading, names, stamps, *, more=()):
+    """Write a drive as CSV with columns of these names; return it as it should be read."""
+    drive = winding(len(stamps), 1.0)
+    xyzw = np.roll(drive.orientations_quat_wxyz, -1, axis=1)
+    columns = {"t": stamps, **dict(zip("xyz", drive.positions_xyz.T, strict=True))}
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), xyzw.T, strict=True))
+    columns |= {"n": range(len(stamps)), "v": np.full(len(stamps), 7.0), "s": ["map"] * len(stamps)}
+    rows = zip(*([str(value) for value in columns[name]] for name in names), strict=True)
+    write(path, "\n".join([*heading, *(",".join(row) for row in rows)]) + "\n")
+    return drive
+
+
+@pytest.mark.parametrize(
+    ("heading", "names"),
+    [
+        ("num,t,x,y,z,qx,qy,qz,qw", "n t x y z qx qy qz qw"),
+        ("timestamp,tx,ty,tz,qw,qx,qy,qz", "t x y z qw qx qy qz"),
+        ("# time [s], q_x, q_y, q_z, q_w, p_x, p_y, p_z", "t qx qy qz qw x y z"),
+        ("frame_id,Stamp(s),pos_x,pos_y,pos_z,vx,quat_w,quat_x,quat_y,quat_z",
+         "s t x y z v qw qx qy qz"),
+        ("%time,header.frame_id,pose.position.x,pose.position.y,pose.position.z,"
+         "pose.orientation.x,pose.orientation.y,pose.orientation.z,pose.orientation.w,twist.linear.x",
+         "t s x y z qx qy qz qw v"),
+        ("#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [],"
+         " q_RS_z [], v_RS_R_x [m s^-1], b_w_RS_S_x [rad s^-1]", "t x y z qw qx qy qz v v"),
+    ],
+    ids=["mcd", "w first", "orientation first", "text between", "ros", "euroc"],
+)  # fmt: skip
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e6, 1e9])
+def test_columns_are_found_by_the_headings_names(tmp_path, heading, names, scale):
+    stamps = START + np.arange(40) * 0.1 + 0.05
+    if scale > 1:
+        heading = heading.replace("[s]", "").replace("(s)", "")
+        counts = [f"{stamp * scale:.0f}" for stamp in stamps]
+    else:
+        counts = [f"{stamp:.3f}" for stamp in stamps]
+    drive = csv_of(tmp_path / "a.csv", [heading], names.split(), counts)
+    drive.timestamps = stamps
+    assert same(read_trajectory(tmp_path / "a.csv"), drive)
+
+
+@pytest.mark.parametrize(
+    ("heading", "scale"), [("timestamp [ns]", 1e9), ("t_ms", 1e3), ("time (us)", 1e6)]
+)
+def test_the_heading_says_the_unit(tmp_path, heading, scale):
+    stamps = np.arange(40) * 1000.0  # of no plausible unit, or of several
+    names = "x,y,z,qx,qy,qz,qw"
+    drive = csv_of(tmp_path / "a.csv", [f"{heading},{names}"], ["t", *names.split(",")], stamps)
+    drive.timestamps = stamps / scale
+    assert same(read_trajectory(tmp_path / "a.csv"), drive)
+
+
+ROW = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+
+
+@pytest.mark.parametrize("first", [0, START])
+@pytest.mark.parametrize("step", [1, 2, 10])
+def test_whole_seconds_without_a_heading(tmp_path, first, step, caplog):
+    stamps = first + step * np.arange(40)
+    drive = csv_of(tmp_path / "a.csv", [], ROW, stamps)
+    drive.timestamps = stamps.astype(float)
+    assert same(read_trajectory(tmp_path / "a.csv"), drive)
+    assert "taken for seconds" in caplog.text
+
+
+@pytest.mark.parametrize("first", [0, 1_403_636_579_758_555_392])
+@pytest.mark.parametrize("interval", [1_000_000, 5_000_000, 100_000_000, 1_000_000_000])
+def test_whole_nanoseconds_stay_so(tmp_path, first, interval, caplog):
+    stamps = first + interval * np.arange(40)
+    drive = csv_of(tmp_path / "a.csv", [], [*ROW[:4], "qw", *ROW[4:7]], stamps)
+    drive.timestamps = stamps / 1e9
+    assert same(read_trajectory(tmp_path / "a.csv"), drive)
+    assert caplog.text == ""

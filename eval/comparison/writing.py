@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from eval.comparison.runs import Missing
 from eval.comparison.table import Table
-from eval.files import atomic_path
+from eval.files import atomic_path, plain_cell
 
 # What LaTeX's own fonts have no letter for.
 _LATEX = {"±": r"$\pm$", "→": r"$\rightarrow$", "²": r"$^2$"}
@@ -24,7 +24,8 @@ def write_tables(folder: Path, tables: Sequence[Table], missing: Sequence[Missin
     _write(folder / "comparison.md", markdown(tables, missing))
     _write(folder / "comparison.tex", latex(tables))
     for table in tables:
-        text = table.numbers().to_csv(index=False, lineterminator="\n")
+        frame = table.numbers().map(plain_cell).rename(columns=plain_cell)
+        text = frame.to_csv(index=False, lineterminator="\n")
         _write(folder / f"{table.name}.csv", text)
 
 
@@ -32,7 +33,8 @@ def markdown(tables: Iterable[Table], missing: Sequence[Missing]) -> str:
     """Return all tables with their notes, and what is in none of them."""
     parts = ["# Comparison of runs"]
     for table in tables:
-        parts += [f"## {table.title}", _markdown_table(table), _bullets(table.notes)]
+        title = _plain(table.title)
+        parts += [f"## {title}", _markdown_table(table), _bullets(table.notes)]
     if missing:
         parts += [
             f"## Not in the tables: {len(missing)}",
@@ -49,7 +51,9 @@ def latex(tables: Iterable[Table]) -> str:
 def _markdown_table(table: Table) -> str:
     frame = table.text(flat=True)
     cells = _marked(frame, table.best(), "**{}**")
-    escaped = [[text.replace("|", "\\|") for text in row] for row in [[*frame.columns], *cells]]
+    escaped = [
+        [_plain(text).replace("|", "\\|") for text in row] for row in [[*frame.columns], *cells]
+    ]
     widths = [max(3, *map(len, column)) for column in zip(*escaped, strict=True)]
     named = len(table.index)
     rule = ["-" * w if i < named else "-" * (w - 1) + ":" for i, w in enumerate(widths)]
@@ -87,7 +91,12 @@ def _marked(frame: pd.DataFrame, best: NDArray[np.bool_], mark: str) -> list[lis
 
 
 def _bullets(lines: Iterable[str]) -> str:
-    return "\n".join(f"- {line}" for line in lines)
+    return "\n".join(f"- {_plain(line)}" for line in lines)
+
+
+def _plain(text: str) -> str:
+    """Return text in one line that Markdown doesn't take for HTML."""
+    return " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;")
 
 
 def _write(path: Path, text: str) -> None:

@@ -22,6 +22,7 @@ from lifelong_slam.sources.ordering import in_order
 from lifelong_slam.sources.pointcloud2 import Cloud, decode
 from lifelong_slam.sources.recording import Recording, open_recording
 from lifelong_slam.sources.static_frames import BASE_FRAMES, StaticFrames, bare
+from lifelong_slam.sources.units import check_scale
 from lifelong_slam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class BagSource:
         topic: str | None = None,
         reference_topic: str | None = None,
         frame: str | None = None,
+        scale: float = 1.0,
     ) -> None:
         """Find the topics, and read the static poses of the LiDARs.
 
@@ -60,16 +62,18 @@ class BagSource:
             topic: a PointCloud2 (or Livox CustomMsg) topic; None takes the only one there is.
             reference_topic: Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped.
             frame: frame_id of the LiDAR to read, where several share the topic; None reads all.
+            scale: metres in one unit of the clouds' coordinates.
 
         Raises:
-            SourceError: the path is missing or not a bag, or nothing tells when the clouds were
-                measured.
+            SourceError: the path is missing or not a bag, the scale makes no sense, or nothing tells when
+                the clouds were measured.
             TopicError: a topic or frame is missing, has the wrong type, or must be named.
         """
         self.path = Path(path)
         self.reference_topic = reference_topic
         self.unreadable = 0
         self.reordered = 0
+        self._scale = check_scale(scale)
         self._recording = open_recording(self.path)
         topics = dict(self._recording.topics)
         self.topic = _choose_topic(topics, topic, self.path)
@@ -96,7 +100,7 @@ class BagSource:
         self.unreadable = self.reordered = 0
         self._lidars.rewind()
         lidars: deque[str] = deque()
-        sweeps = assemble(self._clouds(lidars), self._where)
+        sweeps = assemble(self._clouds(lidars), self._where, self._scale)
         named_sweeps = ((lidars.popleft(), sweep) for sweep in sweeps)
         scans = join_sweeps(named_sweeps, lambda: self._lidars.turn)
         count = 0

@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.scan import Scan
+from lifelong_slam.sources.bin_layout import KITTI_COLUMNS, find_columns
 from lifelong_slam.sources.cloud_files import SUFFIXES, read_cloud
 from lifelong_slam.sources.natural_order import natural_order
 from lifelong_slam.sources.references import ordered_trajectory
-from lifelong_slam.sources.scan_files import nominal_stamps, read_scans
+from lifelong_slam.sources.scan_files import nominal_stamps, read_scans, stamps_in_names
 from lifelong_slam.sources.text_files import read_poses, read_times
+from lifelong_slam.sources.units import check_scale
 from lifelong_slam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
@@ -23,31 +26,36 @@ _log = logging.getLogger(__name__)
 class FolderSource:
     """Scan files in natural order; the sensor's frame is the base."""
 
-    def __init__(self, path: str, times: str | None = None, poses: str | None = None) -> None:
+    def __init__(
+        self,
+        path: str,
+        times: str | None = None,
+        poses: str | None = None,
+        columns: int | None = None,
+        scale: float = 1.0,
+    ) -> None:
         """Find the files, and read their times and reference poses.
 
         Args:
             path: a folder of .pcd, .ply or .bin files, or a folder around one such.
-            times: a file of seconds, a line a scan; None takes 10 scans a second.
+            times: a file of seconds, a line a scan; None takes TUM rows' stamps, one a scan, then
+                those in the files' names, then 10 scans a second.
             poses: reference T_reference_sensor of each scan, KITTI 3x4 or TUM rows. TUM rows carry
-                their stamps: any number of them beside `times`, one a scan without.
+                their stamps: any number of them where scans have their own.
+            columns: how many float32 a point of a .bin file has, x y z first; None finds out.
+            scale: metres in one unit of the coordinates.
 
         Raises:
-            SourceError: a path is missing, no scans are there, or counts don't match.
+            SourceError: a path is missing, no scans are there, counts don't match, or columns or
+                scale make no sense.
         """
         self.path = Path(path)
         self.files = find_scan_files(self.path)
+        self._scale = check_scale(scale)
+        self._columns = self._find_columns(columns)
         self._damaged: list[str] = []
         own, rows = (None, None) if poses is None else read_poses(Path(poses))
-        if times is not None:
-            self.stamps = read_times(Path(times))
-            _check_count("times", Path(times), len(self.stamps), len(self.files))
-        elif own is not None:
-            _check_count("TUM poses without times", Path(poses or ""), len(own), len(self.files))
-            _log.info("%s: no times given: stamps are those of the poses", self.path)
-            self.stamps = own
-        else:
-            self.stamps = nominal_stamps(len(self.files), str(self.path))
+        self.stamps = self._read_stamps(times, own, str(poses))
         if own is None and rows is not None:
             _check_count("poses", Path(poses or ""), len(rows), len(self.files))
             own = self.stamps
@@ -65,7 +73,10 @@ class FolderSource:
         Raises:
             SourceError: not one file could be read.
         """
-        yield from read_scans(self.files, self.stamps, read_cloud, str(self.path), self._damaged)
+        read = partial(read_cloud, columns=self._columns)
+        yield from read_scans(
+            self.files, self.stamps, read, str(self.path), self._damaged, self._scale
+        )
 
     @property
     def unreadable(self) -> int:
@@ -80,6 +91,33 @@ class FolderSource:
     def T_base_sensor(self) -> NDArray[np.float64]:
         """The (4, 4) identity: files don't say where the sensor sits."""
         return np.eye(4)
+
+    def _find_columns(self, given: int | None) -> int:
+        """Return the number of columns of BIN files; of no meaning for others."""
+        if given is not None and given < 3:
+            raise SourceError(f"columns must be at least 3, for x y z, not {given}")
+        if given is not None or self.files[0].suffix.lower() != ".bin":
+            return given or KITTI_COLUMNS
+        return find_columns(self.files, str(self.path))
+
+    def _read_stamps(
+        self, times: str | None, own: NDArray[np.int64] | None, poses: str
+    ) -> NDArray[np.int64]:
+        """Return (N,) stamps in ns of the scans, `own` being those of the poses."""
+        count = len(self.files)
+        if times is not None:
+            stamps = read_times(Path(times))
+            _check_count("times", Path(times), len(stamps), count)
+            return stamps
+        named = stamps_in_names(self.files)
+        if named is not None and (own is None or len(own) != count):
+            _log.info("%s: no times given: stamps are those in the files' names", self.path)
+            return named
+        if own is not None:
+            _check_count("TUM poses without times", Path(poses), len(own), count)
+            _log.info("%s: no times given: stamps are those of the poses", self.path)
+            return own
+        return nominal_stamps(count, str(self.path))
 
 
 def find_scan_files(path: Path) -> list[Path]:

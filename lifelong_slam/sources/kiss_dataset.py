@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lifelong_slam.errors import SourceError, did_you_mean
 from lifelong_slam.scan import NANOSECONDS, Scan
 from lifelong_slam.sources.references import ordered_trajectory
+from lifelong_slam.sources.units import check_scale
 from lifelong_slam.trajectory import Trajectory, parse_seconds
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ class KissDatasetSource:
         path: str,
         sequence: str | int | None = None,
         topic: str | None = None,
+        scale: float = 1.0,
     ) -> None:
         """Open the data set.
 
@@ -43,12 +45,14 @@ class KissDatasetSource:
             path: the data set's folder or file.
             sequence: for loaders of several sequences.
             topic: for loaders of recordings.
+            scale: metres in one unit of the loader's coordinates.
 
         Raises:
             SourceError: no such loader or path, a package it needs is missing, or it refuses.
         """
         self.path = Path(path)
         self.loader = loader
+        self._scale = check_scale(scale)
         options = {"sequence": None if sequence is None else str(sequence), "topic": topic}
         self._dataset = self._open({n: v for n, v in options.items() if v is not None})
         self._count = self._guarded(lambda: len(self._dataset))
@@ -77,7 +81,8 @@ class KissDatasetSource:
                     _log.warning("scan %d left out: %s", index, error)
                 continue
             self._stamps[index] = self._stamp(index)
-            yield self._scan(index, np.asarray(points, dtype=np.float64), np.asarray(times))
+            points = self._scale * np.asarray(points, dtype=np.float64)
+            yield self._scan(index, points, np.asarray(times))
         if self.unreadable:
             _log.warning("%s: %d unreadable scans left out", self.path, self.unreadable)
         if self.unreadable == self._count > 0:

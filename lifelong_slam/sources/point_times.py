@@ -2,11 +2,16 @@
 
 Drivers disagree on a point time's field name, datatype, unit (s, ms, us, ns) and origin (the
 sweep's start or end, the Unix epoch, the sensor's own clock). `PointTimes` looks at the first
-sweeps of a recording, decides once, logs what it decided, and keeps to it.
+sweeps of a recording that tell, decides once, logs what it decided, and keeps to it.
 
 The unit follows from two facts. A sweep lasts between 2 ms and 2 s: those bounds are a factor of
 1000 apart, as are the units, so at most one unit makes a given span plausible. And times that count
 from the epoch have the magnitude of the header stamp in one unit only.
+
+Many drivers count in 32 bits without a sign. Where a header is later than the first point, or the
+sensor's own counter overflows, such counts wrap around 2^32: in nanoseconds that is 4.29 s. A sweep is
+shorter than half of it, so what lies further from its reference than a sweep lasts, but near to a
+whole wrap, can only have wrapped (also where the count was copied to a wider field since).
 """
 
 import logging
@@ -27,6 +32,7 @@ SHORTEST_SWEEP = 0.002
 LONGEST_SWEEP = 2.0
 
 _UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+_WRAPS = tuple(2**32 * unit for unit in _UNITS.values())  # nanoseconds after which 32 bits wrap
 _STEADY = 0.25  # seconds that sweeps may lie about relative to their stamps
 _PRECISE_EPOCH = 1_000_000 * NANOSECONDS  # later stamps count from the epoch, not from power-up
 _NAMES = (
@@ -57,6 +63,12 @@ class Sweep:
         returns = np.isfinite(self.points).all(axis=1) & self.points.any(axis=1)
         return np.asarray(returns)
 
+    @property
+    def tells(self) -> bool:
+        """Whether a candidate field differs between returns, as times do."""
+        returns = self.returns
+        return any(_differ(_measured(values[returns])) for values in self.times.values())
+
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
@@ -77,22 +89,10 @@ class Encoding:
         """Return (N,) seconds from `stamp` of (N,) raw values; "sweep" counts from the least."""
         if len(values) == 0:
             return np.empty(0)
-        zero = self._zero(values, stamp)
-        if np.issubdtype(values.dtype, np.integer):  # exact: no float holds epoch nanoseconds
-            counts = values.astype(np.int64) - int(zero // self.unit)
-            nanoseconds = (counts * self.unit - int(zero % self.unit)).astype(np.float64)
-        else:
-            nanoseconds = (values.astype(np.float64) - zero / self.unit) * self.unit
-        return nanoseconds / NANOSECONDS
-
-    def _zero(self, values: Values, stamp: int) -> int | float:
-        """Return the nanoseconds, on the field's clock, that are offset zero."""
-        if self.origin == "header":
-            return 0
-        if self.origin == "epoch":
-            return stamp
-        whole = np.issubdtype(values.dtype, np.integer)
-        return (int(values.min()) if whole else float(np.nanmin(values))) * self.unit
+        if self.origin == "sweep":
+            nanoseconds = _since_first(values, self.unit)
+            return (nanoseconds - np.nanmin(nanoseconds)) / NANOSECONDS
+        return _nanoseconds(values, self.unit, stamp if self.origin == "epoch" else 0) / NANOSECONDS
 
 
 def is_time_field(name: str) -> bool:
@@ -112,19 +112,25 @@ class PointTimes:
     odd_sweeps: int = field(default=0)
 
     def decide(self, sweeps: Sequence[Sweep]) -> None:
-        """Choose the encoding from the first sweeps, or none, and log the choice once."""
-        self.decided = True
+        """Choose the encoding from some sweeps, or none for now; the first answer is logged."""
         names = sorted({name for sweep in sweeps for name in sweep.times}, key=_preference)
-        if not names:
-            _log.warning("%s: no point times: sweeps can't be deskewed", self.where)
-            return
         for name in names:
             self.encoding = _find_encoding(name, [s for s in sweeps if name in s.times])
             if self.encoding:
                 unit = next(key for key, value in _UNITS.items() if value == self.encoding.unit)
                 origin = _ORIGINS[self.encoding.origin]
                 _log.info("%s: point times in field '%s', %s %s", self.where, name, unit, origin)
-                return
+                break
+        else:
+            self._warn_of_none(names)
+        self.decided = True
+
+    def _warn_of_none(self, names: Sequence[str]) -> None:
+        if self.decided:
+            return
+        if not names:
+            _log.warning("%s: no point times: sweeps can't be deskewed", self.where)
+            return
         _log.warning(
             "%s: point times in %s are constant or span no plausible sweep: treated as absent, "
             "sweeps can't be deskewed",
@@ -178,14 +184,10 @@ def _preference(name: str) -> tuple[int, str]:
 def _find_encoding(name: str, sweeps: Sequence[Sweep]) -> Encoding | None:
     """Return the encoding that makes the median sweep plausible, or None."""
     samples = [(s.stamp, _measured(s.times[name][s.returns])) for s in sweeps]
-    samples = [(stamp, values) for stamp, values in samples if len(values) > 1]
+    samples = [(stamp, values) for stamp, values in samples if _differ(values)]
     if not samples:
         return None
-    quantiles = [np.quantile(v.astype(np.float64), (0.005, 0.5, 0.995)) for _, v in samples]
-    span = float(np.median([high - low for low, _, high in quantiles]))
-    middle = len(samples) // 2
-    whole = np.issubdtype(samples[0][1].dtype, np.integer)
-    unit = _unit(span, float(quantiles[middle][1]), samples[middle][0], whole)
+    unit = _unit(samples)
     return None if unit is None else Encoding(name, unit, _origin(name, samples, unit))
 
 
@@ -196,16 +198,62 @@ def _measured(values: Values) -> Values:
     return values if values.dtype.kind in "iu" else values[:0]
 
 
-def _unit(span: float, middle: float, stamp: int, whole: bool) -> int | None:
+def _differ(values: Values) -> bool:
+    return bool((values != values[:1]).any())
+
+
+def _unit(samples: Sequence[tuple[int, Values]]) -> int | None:
     """Return the nanoseconds in one count, or None where no unit gives a plausible sweep."""
-    for unit in _UNITS.values():
+    stamp, values = samples[len(samples) // 2]
+    middle = float(np.median(values))
+    whole = np.issubdtype(values.dtype, np.integer)  # whole seconds can't time a sweep's points
+    units = list(_UNITS.values())[whole:]
+    for unit in units:
         like_stamp = abs(middle * unit - stamp) < 0.1 * stamp
         if stamp > _PRECISE_EPOCH and like_stamp:
-            return unit if 0 < span * unit < LONGEST_SWEEP * NANOSECONDS else None
-    for unit in list(_UNITS.values())[whole:]:  # whole seconds can't time a sweep's points
-        if SHORTEST_SWEEP * NANOSECONDS <= span * unit < LONGEST_SWEEP * NANOSECONDS:
+            return unit if 0 < _span(samples, unit) < LONGEST_SWEEP else None
+    for unit in units:
+        if SHORTEST_SWEEP <= _span(samples, unit) < LONGEST_SWEEP:
             return unit
     return None
+
+
+def _span(samples: Sequence[tuple[int, Values]], unit: int) -> float:
+    """Return the seconds that the median sweep lasts."""
+    ends = [np.quantile(_since_first(values, unit), (0.005, 0.995)) for _, values in samples]
+    return float(np.median(np.diff(ends))) / NANOSECONDS
+
+
+def _since_first(values: Values, unit: int) -> NDArray[np.float64]:
+    """Return (N,) nanoseconds from the first finite value."""
+    return _nanoseconds(values, unit, _first(values) * unit)
+
+
+def _first(values: Values) -> int | float:
+    if np.issubdtype(values.dtype, np.integer):
+        return int(values[:1].astype(np.int64)[0])
+    return float(values[np.argmax(np.isfinite(values))])
+
+
+def _nanoseconds(values: Values, unit: int, zero: int | float) -> NDArray[np.float64]:
+    """Return (N,) nanoseconds after `zero`, of counts of `unit` nanoseconds that may have wrapped."""
+    if np.issubdtype(values.dtype, np.integer):  # exact: no float holds epoch nanoseconds
+        zero = int(zero)
+        counts = values.astype(np.int64) - zero // unit
+        nanoseconds = counts.astype(np.float64) * unit - zero % unit
+    else:
+        nanoseconds = (values.astype(np.float64) - zero / unit) * unit
+    return _unwrapped(nanoseconds)
+
+
+def _unwrapped(nanoseconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Undo the wrap of those that lie about as far off as 32 bits of some unit reach."""
+    limit = LONGEST_SWEEP * NANOSECONDS
+    if not (np.abs(nanoseconds) > limit).any():
+        return nanoseconds
+    for wrap in (*_WRAPS, *np.negative(_WRAPS)):
+        nanoseconds = np.where(np.abs(nanoseconds - wrap) <= limit, nanoseconds - wrap, nanoseconds)
+    return nanoseconds
 
 
 def _origin(name: str, samples: Sequence[tuple[int, Values]], unit: int) -> str:
