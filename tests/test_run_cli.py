@@ -139,6 +139,40 @@ def test_a_sweep_goes_on_after_a_job_that_failed(cli, tmp_path):
     assert folder.name.startswith("1_")
 
 
+def spoil(folder, scans):
+    """Leave five points of each of some scans."""
+    for i in scans:
+        path = folder / f"{i:06d}.bin"
+        np.fromfile(path, np.float32).reshape(-1, 4)[::1200].tofile(path)
+
+
+def test_a_lost_run_is_written_and_says_why(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 10)
+    spoil(scans, range(2, 10))
+    status, out, err = cli("sensor=solid_state", "scenario=folder", f"scenario.path={scans}")
+    assert status == 3
+    folder = Path(out.splitlines()[-1].removeprefix("Run folder: "))
+    assert {path.name for path in folder.iterdir()} == FILES
+    verdict = json.loads((folder / "metrics.json").read_text())["run"]["verdict"]
+    assert verdict["status"] == "lost"
+    assert "8 of 10 scans could not be registered" in verdict["reasons"][0]
+    assert verdict["reasons"][0] in err
+    assert verdict["reasons"][0] in (folder / "report.html").read_text()
+
+
+def test_a_sweep_goes_on_after_a_run_that_was_lost(cli, tmp_path):
+    folders = [write_folder(tmp_path / name, 8) for name in ("lost", "good")]
+    spoil(folders[0], range(2, 8))
+    paths = f"scenario.path={folders[0]},{folders[1]}"
+    status, _, _ = cli("-m", "sensor=solid_state", "scenario=folder", paths, "hydra.sweep.dir=all")
+    assert status == 3
+    verdicts = [
+        json.loads(path.read_text())["run"]["verdict"]["status"]
+        for path in sorted((tmp_path / "all").glob("*/metrics.json"))
+    ]
+    assert verdicts == ["lost", "good"]
+
+
 def test_help_lists_groups_and_examples(cli):
     status, out, _ = cli("--help")
     assert status == 0
