@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eval.errors import FileError
+from eval.errors import FileError, readable
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None
     found = len(row.split(delimiter))
     if found < columns or (delimiter is None and found > columns):
         raise FileError(f"{path} is not a {kind}: {found} columns instead of {columns}")
-    try:
+    with readable(path, kind):
         rows = np.loadtxt(
             path,
             delimiter=delimiter,
@@ -38,8 +38,6 @@ def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None
             ndmin=2,
             encoding="utf-8-sig",
         )
-    except ValueError as error:
-        raise FileError(f"{path} is not a {kind}: {error}") from error
     check_finite(str(path), rows)
     return rows
 

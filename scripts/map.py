@@ -183,7 +183,7 @@ def iso_time(nanoseconds: int) -> str:
 
 def show(facts: dict[str, Any]) -> None:
     """Print what is in a map as two tables."""
-    console = Console()
+    console = Console(markup=False)
     sessions = Table(box=None, pad_edge=False)
     for column in ("Session", "Started", "Source", "State"):
         sessions.add_column(column)

@@ -179,7 +179,7 @@ def show(facts: dict[str, Any]) -> None:
         values = [state[key] for state in states]
         if values[0] is not None:
             table.add_row(name, *(format(value, form) for value in values))
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     console.print(
         f"Mean distance from the optimum: {facts['moved_staying_m']:.4f} m (vertices that stay),"

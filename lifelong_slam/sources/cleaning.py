@@ -71,7 +71,8 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
         if unreadable := getattr(source, "unreadable", 0):
             counts.skipped[UNREADABLE] = unreadable
     if counts.used == 0:
-        raise SourceError(f"no usable scans in this recording: {counts.summary()}")
+        where = getattr(source, "path", "this recording")
+        raise SourceError(f"no usable scans in {where}: {counts.summary()}")
 
 
 def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
