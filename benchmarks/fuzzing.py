@@ -173,25 +173,25 @@ _text_damage = (
 # --- running
 
 
-def fuzz(form: Format, seconds: float, seed: int) -> Outcome:
-    """Read mutated files of a format for a while."""
+def fuzz(form: Format, seconds: float, seed: int, most: int = 10**9) -> Outcome:
+    """Read mutated files of a format for a while, `most` of them at most."""
     outcome = Outcome()
     with tempfile.TemporaryDirectory() as name:
         sound = Path(name) / "sound"
         sound.mkdir()
         file = form.write(sound)
-        status, said = _attempt(form.read, file)[:2]
+        status, said = attempt(form.read, file)[:2]
         if status != "read":
             raise RuntimeError(f"a sound {form.name} is {status}: {said}")
         until = time.monotonic() + seconds
         number = 0
-        while time.monotonic() < until:
+        while time.monotonic() < until and number < most:
             number += 1
             folder = Path(name) / "mutated"
             shutil.copytree(sound, folder)
             mutated = folder / file.relative_to(sound)
             _write_mutated(mutated, random.Random(f"{form.name} {seed} {number}"))
-            kinds, said = _attempt(form.read, mutated)
+            kinds, said = attempt(form.read, mutated)
             outcome.counts[kinds] += 1
             if kinds not in ("read", "refused"):
                 outcome.escaped.append(f"{form.name} seed {seed} number {number}: {kinds}: {said}")
@@ -220,8 +220,13 @@ def _mutate_blob(file: Path, rng: random.Random) -> None:
         database.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (sealed, row))
 
 
-def _attempt(read: Callable[[Path], object], file: Path) -> tuple[str, str]:
-    """Read a file in a process of its own; return what became of it, and what was said."""
+def attempt(read: Callable[[Path], object], file: Path) -> tuple[str, str]:
+    """Read a file in a process of its own.
+
+    Returns:
+        What became of it: ``read``, ``refused`` (by an error that names a file), ``traceback``,
+        ``abort``, ``slow`` or ``large``; and the error's text.
+    """
     ours, theirs = os.pipe()
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     child = os.fork()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from eval.errors import FileError, readable
 from eval.nearest import Points
+from eval.text_table import LARGEST
 from formats.las import check_las
 from formats.pcd import read_pcd
 from formats.ply import read_ply
@@ -20,7 +21,7 @@ _log = logging.getLogger(__name__)
 def read_map(path: Path) -> Points:
     """Read the (N, 3) points of a map, in metres; N may be 0.
 
-    Points with NaN or infinite coordinates are dropped, and their number is logged.
+    Points with NaN or infinite coordinates, or some beyond `LARGEST`, are dropped and counted in the log.
 
     Args:
         path: a PLY or PCD file, in text or binary, compressed or not, or a LAS or LAZ file.
@@ -38,11 +39,12 @@ def read_map(path: Path) -> Points:
     if reader is None:
         raise FileError(f"{path} is no map file: its name must end with {', '.join(_READERS)}")
     points = reader(path)
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+    measured = (points >= -LARGEST) & (points <= LARGEST)
+    finite: NDArray[np.bool_] = np.asarray(measured.all(axis=1))
     if finite.all():
         return points
     _log.warning(
-        "%s: %d of %d points dropped, which have NaN or infinite coordinates",
+        "%s: %d of %d points dropped, which have NaN or infinite coordinates, or above 1e20 m",
         path, np.count_nonzero(~finite), len(finite),
     )  # fmt: skip
     return points[finite]

@@ -9,6 +9,8 @@ from eval.errors import FileError, readable
 
 Array = NDArray[np.float64]
 
+LARGEST = 1e20  # of what can be measured: nanoseconds since 1970 are 1e18
+
 
 def read_table(path: Path, kind: str, columns: int, delimiter: str | None = None) -> Array:
     """Read rows of numbers, all of them finite; `#` starts a comment, one heading may come first.
@@ -66,11 +68,12 @@ def first_row(path: Path, kind: str) -> tuple[int, str]:
 
 
 def check_finite(where: str, rows: Array) -> None:
-    """Raise FileError if (N, K) rows hold NaN or infinity."""
-    bad = ~np.isfinite(rows).all(axis=1)
+    """Raise FileError if (N, K) rows hold NaN, infinity or numbers above `LARGEST`."""
+    bad = ~(np.abs(rows) <= LARGEST).all(axis=1)
     if bad.any():
         raise FileError(
-            f"{where}: {int(bad.sum())} of {len(rows)} rows hold NaN or infinity,"
+            f"{where}: {int(bad.sum())} of {len(rows)} rows hold NaN or infinity, or numbers above"
+            f" {LARGEST:g},"
             f" first row {int(np.argmax(bad)) + 1}"
         )
 

@@ -78,9 +78,8 @@ class Inflater:
             return data
         if size > self._left:
             raise ValueError("the chunks before hold as much as the file plausibly can")
-        plain = inflate(data, compression, size)
-        self._left -= len(plain)
-        return plain
+        self._left -= size
+        return inflate(data, compression, size)
 
 
 def _inflate_bz2(data: bytes, most: int) -> bytes:

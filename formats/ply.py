@@ -64,6 +64,8 @@ def _elements(header: list[list[str]], order: str) -> list[tuple[str, int, list[
         if words[:1] == ["element"]:
             if elements and elements[-1][0] == "vertex":
                 break
+            if int(words[2]) < 0:
+                raise ValueError(f"it has {words[2]} elements '{words[1]}'")
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and elements:
             *kinds, name = words[2:] if words[1] == "list" else words[1:]
@@ -80,7 +82,7 @@ def _record_type(properties: list[_Property]) -> np.dtype[np.void]:
 def _after_lines(body: memoryview, count: int, _: list[_Property]) -> memoryview:
     """Return what follows so many lines."""
     lines = BytesIO(body)
-    for _line in islice(lines, max(count, 0)):
+    for _line in islice(lines, count):
         pass
     return body[lines.tell() :]
 

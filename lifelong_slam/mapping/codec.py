@@ -19,7 +19,7 @@ from collections.abc import Mapping
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
-from pydantic import NonNegativeInt, TypeAdapter
+from pydantic import NonNegativeInt, TypeAdapter, ValidationError
 
 from formats.bounded import inflate
 
@@ -84,6 +84,8 @@ def unpack(blob: bytes, layout: Layout) -> dict[str, NDArray[np.generic]]:
         if (code, shape[1:]) != (kind.str, [*row]):
             raise ValueError(f"its array '{name}' is {code} {shape}")
         count = math.prod(shape)
+        if count * kind.itemsize > len(plain) - position:
+            raise ValueError(f"its array '{name}' isn't whole")
         planes = np.frombuffer(plain, np.uint8, count * kind.itemsize, position)
         position += count * kind.itemsize
         rows = planes.reshape(kind.itemsize, count).T.copy(order="C")
@@ -150,8 +152,10 @@ def _header(plain: memoryview) -> tuple[dict[str, tuple[str, list[int]]], int]:
         if end > len(plain):
             raise ValueError("its header isn't whole")
         return _HEADER.validate_json(bytes(plain[_LENGTH.size : end])), end
-    except (struct.error, ValueError) as error:
-        raise ValueError(f"its header is damaged: {' '.join(str(error).split())}") from error
+    except struct.error as error:
+        raise ValueError("its header isn't whole") from error
+    except ValidationError as error:
+        raise ValueError(f"its header is damaged: {error.errors()[0]['msg']}") from error
 
 
 def _sealed(data: bytes) -> bytes:
