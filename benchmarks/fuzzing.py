@@ -527,37 +527,41 @@ def _compare(file: Path) -> None:
     write_report(folder / "report.html", runs, make_tables(runs.finished))
 
 
+def keyframe(session: int, i: int, points: int = 100, first: int = 0) -> MapUpdate:
+    """Return what the i-th keyframe of a straight drive adds to a map, where `first` began the session."""
+    rng, step = np.random.default_rng(i), np.array([0, 0, 0.1, 2.0, 0, 0])
+    T, cloud = exp(i * step), _points(points)
+    stamps = _STAMP + i * 10**9 + np.arange(4) * 10**8
+    voxels: dict[str, NDArray[np.generic]] = {
+        "keys": np.sort(rng.choice(2**62, points, replace=False)),
+        "means": cloud,
+        "weights": np.ones(points, np.uint8),
+        "scores": np.ones(points, np.int8),
+    }
+    edge = Edge(i - 1, i, exp(step), np.eye(6), "loop" if i == first else "odometry")
+    return MapUpdate(
+        keyframes=[Keyframe(i, session, _STAMP + i * 10**9, T, np.eye(6), 2.0 * i, cloud, cloud)],
+        poses={i: T},
+        edges={i: edge} if i else {},
+        scans=[Scans(session, i, stamps, np.tile(np.eye(4), (4, 1, 1)))],
+        submaps={i: voxels},
+        places={i: cloud},
+    )
+
+
+def new_map(path: Path) -> MapStore:
+    """Make a map without sessions and open it for writing."""
+    return MapStore.create(path, "hdl64", np.eye(4), 0.2)
+
+
 def _write_map(folder: Path) -> Path:
     """Write a map of one session, with something in each table but those of removed keyframes."""
-    rng, path = np.random.default_rng(0), folder / "place.map"
-    step = np.array([0, 0, 0.1, 2.0, 0, 0])
-    with MapStore.create(path, "hdl64", np.eye(4), 0.2) as store:
+    with new_map(folder / "place.map") as store:
         session = store.begin_session("drive", "seed: 0\n")
         for i in range(4):
-            T, points = exp(i * step), _points(100)
-            keyframe = Keyframe(
-                i, session, _STAMP + i * 10**9, T, np.eye(6), 2.0 * i, points, points
-            )
-            stamps = _STAMP + i * 10**9 + np.arange(4) * 10**8
-            voxels: dict[str, NDArray[np.generic]] = {
-                "keys": np.sort(rng.choice(2**62, 50, replace=False)),
-                "means": _points(50),
-                "weights": np.ones(50, np.uint8),
-                "scores": np.ones(50, np.int8),
-            }
-            edge = {i: Edge(i - 1, i, exp(step), np.eye(6), "odometry")} if i else {}
-            store.write(
-                MapUpdate(
-                    keyframes=[keyframe],
-                    poses={i: T},
-                    edges=edge,
-                    scans=[Scans(session, i, stamps, np.tile(np.eye(4), (4, 1, 1)))],
-                    submaps={i: voxels},
-                    places={i: points},
-                )
-            )
+            store.write(keyframe(session, i))
         store.end_session(session)
-    return path
+    return folder / "place.map"
 
 
 def _read_map_file(file: Path) -> None:

@@ -22,6 +22,7 @@ Timeline = dict[str, NDArray[np.float64]]
 _AXES = {"VERTEX_SE3:QUAT": 3, "VERTEX_SE2": 2}  # coordinates of a vertex's position
 _KINDS = ("odometry", "loop", "composed")
 _DEEPEST = 50  # levels of YAML
+_MOST_GROWTH = 10_000  # by which interpolations may multiply a text
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_yaml_text(path: Path) -> str:
     """Read the text of a YAML file that has no aliases, by which a few lines can hold millions of items.
 
-    Nor is it nested deeper than any settings are, which would be more than a parser can take.
+    Nor is it nested deeper than any settings are, which would be more than a parser can take, or refers
+    to itself by interpolations (``${a}${a}``) that multiply.
 
     Raises:
         FileError: the file is missing, no YAML, or has either.
@@ -113,12 +115,16 @@ def read_yaml_text(path: Path) -> str:
     _require(path, "YAML")
     with readable(path, "YAML file"):
         text = path.read_text()
-        depth = 0
+        depth, growth = 0, 1
         for event in yaml.parse(text, Loader=yaml.CSafeLoader):
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError("it has aliases, which no settings need")
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.ScalarEvent):
+                growth *= max(event.value.count("${"), 1)
+            if growth > _MOST_GROWTH:
+                raise ValueError("it has interpolations that multiply")
             if depth > _DEEPEST:
                 raise ValueError(f"it is nested deeper than {_DEEPEST} levels")
         return text

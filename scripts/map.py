@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from console import fail
-from lifelong_slam.errors import LifelongSlamError
+from lifelong_slam.errors import LifelongSlamError, MapError
 from lifelong_slam.mapping.map_check import check_map
 from lifelong_slam.mapping.map_export import export_map, static_points
 from lifelong_slam.mapping.saved_map import SavedMap, Session
@@ -30,9 +30,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         return int(options.command(options))
-    except (LifelongSlamError, OSError) as error:
+    except OSError as error:
         fail(error)
-        return BAD_INPUT
+    except LifelongSlamError as error:
+        named = str(options.file) in str(error)
+        fail(error if named else MapError(f"{options.file}: {error}"))
+    return BAD_INPUT
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""Files that are damaged or made to harm: refused in a line that names them, in time and memory that are bounded.
+"""Files that are damaged or made to harm are refused in a line that names them, soon and in little memory.
 
 Each is read by a process of its own, with limits; see benchmarks/fuzzing.py.
 """
@@ -71,7 +71,7 @@ def test_what_was_compressed_comes_back(compression):
     assert plain.startswith(cut)
     with pytest.raises(ValueError, match="hold more than"):
         inflate(data, compression, len(plain) - 1)
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r"\w"):
         inflate(b"garbage" * 10, compression, len(plain))
 
 
@@ -253,7 +253,10 @@ def test_times_that_are_none(tmp_path, line):
     assert_refused(read_times, tmp_path / "times.txt", "times.txt, line 2")
 
 
-GRID = "image: g.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+GRID = (
+    "image: g.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\n"
+    "occupied_thresh: 0.65\nfree_thresh: 0.2\n"
+)
 LAUGHS = "a: &a [x]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )

@@ -6,6 +6,7 @@ nothing but `metrics.json` will do; its choices are then taken from there.
 """
 
 import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -103,7 +104,7 @@ class Run:
         for key in keys:
             value = value.get(key) if isinstance(value, Mapping) else None
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return float(value) if is_number else None
+        return float(value) if is_number and abs(value) <= sys.float_info.max else None
 
 
 @dataclass(frozen=True, slots=True)

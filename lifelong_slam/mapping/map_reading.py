@@ -19,6 +19,7 @@ from lifelong_slam.result import Edge
 
 _Decoded = TypeVar("_Decoded")
 
+_FARTHEST = 1e8  # metres
 _SCANS: codec.Layout = {"stamps": ("<i8", ()), "xi": ("<f8", (6,))}
 _SUPPORT: codec.Layout = {
     "neighbours": ("<i8", ()),
@@ -62,7 +63,10 @@ def check_references(db: sqlite3.Connection) -> None:
 
 def unpack_pose(blob: bytes) -> Array:
     """Read a (4, 4) pose; raises ValueError if it is damaged."""
-    return codec.unpack_matrix(blob, 4)
+    T = codec.unpack_matrix(blob, 4)
+    if not (np.abs(T) < _FARTHEST).all():
+        raise ValueError("it is not finite, or off the Earth")
+    return T
 
 
 def unpack_covariance(blob: bytes) -> Array:
@@ -83,6 +87,8 @@ def unpack_voxels(blob: bytes) -> Arrays:
     """Read the arrays of a `Submap`; raises ValueError if they are damaged."""
     arrays = codec.unpack(blob, _VOXELS)
     Submap(**arrays)  # type: ignore[arg-type]
+    if not (np.abs(arrays["means"]) < _FARTHEST).all():
+        raise ValueError("a mean is not finite, or off the Earth")
     return arrays
 
 
