@@ -50,7 +50,7 @@ def quote_paths(arguments: Sequence[str]) -> list[str]:
     Args:
         arguments: overrides and options; the latter stay as they are.
     """
-    sweeps = bool({"-m", "--multirun"} & {*arguments})
+    sweeps = bool({"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*arguments})
     return [_with_quoted_path(argument, sweeps) for argument in arguments]
 
 
