@@ -44,7 +44,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARES = {"kills": 0.15, "runs": 0.25, "torn": 0.05, "full": 0.15, "fuzz": 0.4}  # of the time
 _SESSION = 8  # keyframes
 _MOST_KEYFRAMES = 200  # of a map, or else each check takes longer
-_HEADER = 32  # bytes of an SQLite log
+_HEADER, _LONG_LOG = 32, 300_000  # bytes of an SQLite log, the latter with some keyframes in it
 _LINE = "error: "
 
 
@@ -126,7 +126,7 @@ def torn(folder: Path, seconds: float, rng: random.Random) -> list[Faults]:
     """Cut the log of a killed writer, or let it end in garbage."""
     faults, path = Faults("the log of a killed map is torn"), folder / "place.map"
     log = path.with_name("place.map-wal")
-    while not log.exists() or log.stat().st_size < 2 * _HEADER:
+    while not log.exists() or log.stat().st_size < _LONG_LOG:
         killed_writer(path, 1.0, faults)
     whole, sound = path.read_bytes(), log.read_bytes()
     before = None

@@ -425,3 +425,11 @@ def test_mutated_files_are_read_or_refused(form):
 def test_limits_leave_room_for_what_compresses_well():
     assert most_plain(0) > 30_000_000
     assert most_plain(10**6) > 10**8
+
+
+@pytest.mark.slow
+def test_the_benchmark_counts_kills_and_torn_logs():
+    faults = importlib.import_module("faults")
+    found = faults.measure(0.1, 0, ["kills", "torn"])
+    assert all(each.tries for each in found)
+    assert faults.table(found).count("\n") == 3
