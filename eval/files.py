@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from eval.errors import FileError
+from eval.errors import FileError, readable
 from eval.text_table import is_number
 
 Timeline = dict[str, NDArray[np.float64]]
@@ -24,6 +25,8 @@ _AXES = {"VERTEX_SE3:QUAT": 3, "VERTEX_SE2": 2}  # coordinates of a vertex's pos
 _FORMULA = ("=", "+", "-", "@")
 _CONTROL = re.compile(r"[\x00-\x1f]+")  # line breaks and tabs among them
 _KINDS = ("odometry", "loop", "composed")
+_DEEPEST = 50  # levels of YAML
+_MOST_GROWTH = 10_000  # by which interpolations may multiply a text
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +60,9 @@ def read_graph(path: Path) -> GraphSketch:
     positions: dict[int, list[float]] = {}
     edges: list[tuple[int, int, str]] = []
     kind = ""
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    with readable(path, "pose graph"):
+        lines = path.read_text().splitlines()
+    for number, line in enumerate(lines, 1):
         content, _, comment = line.partition("#")
         tag, *fields = content.split() or [""]
         named = comment.strip() if comment.strip() in _KINDS else kind
@@ -81,13 +86,10 @@ def read_timeline(path: Path) -> Timeline:
         FileError: the file is missing, has no header, or a cell is not a number.
     """
     _require(path, "timeline")
-    with path.open(newline="") as file:
+    with readable(path, "table of numbers"), path.open(newline="") as file:
         header, *rows = list(csv.reader(file)) or [[]]
-    try:
         values = np.array([[float(cell) for cell in row] for row in rows])
         values = values.reshape(len(rows), len(header))
-    except ValueError as error:
-        raise FileError(f"{path} is not a table of numbers: {error}") from error
     return {name: values[:, i] for i, name in enumerate(header)}
 
 
@@ -102,6 +104,47 @@ def plain_cell(value: Any) -> Any:
     if not text.startswith(_FORMULA) or is_number(text):
         return text
     return f"'{text}"
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        FileError: the file is missing, no JSON, or something else than an object.
+    """
+    _require(path, "JSON")
+    with readable(path, "JSON file"):
+        value = json.loads(path.read_text())
+        if not isinstance(value, dict):
+            raise ValueError("it holds no object")
+        return value
+
+
+def read_yaml_text(path: Path) -> str:
+    """Read the text of a YAML file that has no aliases, by which a few lines can hold millions of items.
+
+    Nor is it nested deeper than any settings are, which would be more than a parser can take, or refers
+    to itself by interpolations (``${a}${a}``) that multiply.
+
+    Raises:
+        FileError: the file is missing, no YAML, or has either.
+    """
+    _require(path, "YAML")
+    with readable(path, "YAML file"):
+        text = path.read_text()
+        depth, growth = 0, 1
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError("it has aliases, which no settings need")
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.ScalarEvent):
+                growth *= max(event.value.count("${"), 1)
+            if growth > _MOST_GROWTH:
+                raise ValueError("it has interpolations that multiply")
+            if depth > _DEEPEST:
+                raise ValueError(f"it is nested deeper than {_DEEPEST} levels")
+        return text
 
 
 def write_json(path: Path, value: Any) -> None:

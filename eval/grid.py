@@ -10,12 +10,13 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from eval.errors import FileError
+from eval.errors import FileError, readable
+from eval.files import read_yaml_text
 
 Array = NDArray[np.float64]
 
 # Kind, width, height and largest value of a PGM image; comments may stand between them.
-_HEADER = re.compile(rb"(P[25])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d+)" + rb"\s")
+_HEADER = re.compile(rb"(P[25])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"\s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +78,11 @@ def read_grid(path: Path) -> Grid:
 def _describe(path: Path) -> _Description:
     if not path.is_file():
         raise FileError(f"no such grid file: {path}")
+    text = read_yaml_text(path)
+    with readable(path, "YAML file"):
+        settings: Any = yaml.safe_load(text)
     try:
-        settings: Any = yaml.safe_load(path.read_text())
         description = _Description.model_validate(settings)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise FileError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
     except ValidationError as error:
         where = ".".join(map(str, error.errors()[0]["loc"])) or "it"
         message = error.errors()[0]["msg"]
@@ -98,7 +99,7 @@ def _read_image(path: Path) -> NDArray[np.uint8]:
         raise FileError(f"no such grid image: {path}")
     data = path.read_bytes()
     header = _HEADER.match(data)
-    if header is None or int(header[4]) != 255:
+    if header is None or header[4] != b"255":
         raise FileError(f"{path} is not a PGM image with grey values from 0 to 255")
     width, height = int(header[2]), int(header[3])
     try:

@@ -111,7 +111,9 @@ def over_kitti_segments(
 
 def _consecutive(ends: Indices) -> tuple[Indices, Indices]:
     """Chain pieces from pose 0 on, given where a piece that starts at each of the N poses ends."""
-    following = ends.tolist()
+    following = np.maximum(
+        ends, np.arange(len(ends)) + 1
+    ).tolist()  # beyond 1e16 m, no piece is longer
     chain = [0]
     while (end := following[chain[-1]]) < len(following):
         chain.append(end)

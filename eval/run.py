@@ -1,6 +1,5 @@
 """Evaluates a run folder: metrics.json, plots/ and report.html from the files that a run left."""
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from eval.errors import FileError, readable
 from eval.evaluation import Settings, Verdict, evaluate, to_sections
 from eval.evidence import Evidence
 from eval.evidence_files import EvidenceFiles, read_evidence
-from eval.files import write_json
+from eval.files import read_json, write_json
 
 _log = logging.getLogger(__name__)
 
@@ -58,9 +58,11 @@ def run_files(folder: Path) -> EvidenceFiles:
 
 def earlier_info(folder: Path) -> dict[str, Any]:
     """Return section `run` of a folder's metrics.json, empty where there is none."""
+    path = folder / "metrics.json"
     try:
-        info = json.loads((folder / "metrics.json").read_text())["run"]
-    except (OSError, ValueError, KeyError, TypeError):
+        info = read_json(path).get("run") if path.is_file() else None
+    except FileError as error:
+        _log.warning("what an earlier evaluation knew of the run is left out: %s", error)
         return {}
     return info if isinstance(info, dict) else {}
 
@@ -102,4 +104,7 @@ def _write_plots(folder: Path, evidence: Evidence, verdicts: Sequence[Verdict]) 
 def _config_text(folder: Path) -> str:
     """Return the config that Hydra left with a run, empty where there is none."""
     path = folder / ".hydra" / "config.yaml"
-    return path.read_text() if path.is_file() else ""
+    if not path.is_file():
+        return ""
+    with readable(path, "config"):
+        return path.read_text()

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eval.errors import FileError
+from eval.errors import FileError, readable
 
 Array = NDArray[np.float64]
+
+LARGEST = 1e20  # of what can be measured: nanoseconds since 1970 are 1e18
 
 
 def read_table(
@@ -38,7 +40,7 @@ def read_table(
     found = len(row.split(delimiter))
     if found < columns or (delimiter is None and found > columns):
         raise FileError(f"{path} is not a {kind}: {found} columns instead of {columns}")
-    try:
+    with readable(path, kind):
         rows = np.loadtxt(
             path,
             delimiter=delimiter,
@@ -47,8 +49,6 @@ def read_table(
             ndmin=2,
             encoding="utf-8-sig",
         )
-    except ValueError as error:
-        raise FileError(f"{path} is not a {kind}: {error}") from error
     check_finite(str(path), rows)
     return rows
 
@@ -84,11 +84,12 @@ def heading_of(path: Path, rows: int) -> str:
 
 
 def check_finite(where: str, rows: Array) -> None:
-    """Raise FileError if (N, K) rows hold NaN or infinity."""
-    bad = ~np.isfinite(rows).all(axis=1)
+    """Raise FileError if (N, K) rows hold NaN, infinity or numbers above `LARGEST`."""
+    bad = ~(np.abs(rows) <= LARGEST).all(axis=1)
     if bad.any():
         raise FileError(
-            f"{where}: {int(bad.sum())} of {len(rows)} rows hold NaN or infinity,"
+            f"{where}: {int(bad.sum())} of {len(rows)} rows hold NaN or infinity, or numbers above"
+            f" {LARGEST:g},"
             f" first row {int(np.argmax(bad)) + 1}"
         )
 

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from eval.csv_columns import UNITS, find_columns, guess_rate
 from eval.errors import FileError
 from eval.text_table import check_finite, first_row, heading_of, read_table
+from formats.bags import check_chunks, open_bag
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +155,8 @@ def read_bag(path: Path, topic: str | None = None) -> PoseTrajectory3D:
     _require(path)
     try:
         store = get_typestore(Stores.LATEST)  # for bags without definitions
-        with AnyReader([path], default_typestore=store) as reader:
+        check_chunks(path)
+        with open_bag([path], store) as reader:
             topic = _choose(path, reader, topic)
             rows = np.array(list(_rows(reader, topic)), dtype=np.float64)
     except FileError:

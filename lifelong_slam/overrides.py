@@ -1,5 +1,6 @@
 """Composes configs from command lines, and says which override does not fit and what was meant."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -20,6 +21,48 @@ from lifelong_slam.config import one_line
 from lifelong_slam.errors import ConfigError, did_you_mean
 
 _HYDRA_VERSION = "1.3"
+# Settings that are names of files and folders, of all commands.
+_PATHS = {
+    *("hydra.run.dir", "hydra.sweep.dir", "map", "scenario.cache_dir"),
+    *("scenario.path", "scenario.times", "scenario.poses"),
+    *(
+        "estimate",
+        "reference",
+        "reference_map",
+        "relations",
+        "grid",
+        "reference_grid",
+        "run",
+        "out",
+    ),
+    *("graph", "truth", "json"),
+}
+_SWEEP = re.compile(r",|(choice|range|interval|glob|shuffle|sort|tag)\(")
+
+
+def quote_paths(arguments: Sequence[str]) -> list[str]:
+    """Return a command line whose paths are quoted, so that Hydra takes them as the shell gave them.
+
+    Its grammar gives a meaning to commas, brackets, equals signs, tildes and spaces, and knows no umlauts.
+    These keep it in a path: quotes around all of it, ``null``, ``${...}``, and, with ``-m``, commas
+    between the values of a sweep.
+
+    Args:
+        arguments: overrides and options; the latter stay as they are.
+    """
+    sweeps = bool({"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*arguments})
+    return [_with_quoted_path(argument, sweeps) for argument in arguments]
+
+
+def _with_quoted_path(argument: str, sweeps: bool) -> str:
+    key, _, value = argument.partition("=")
+    if key.lstrip("+") not in _PATHS or value in ("", "null") or "${" in value:
+        return argument
+    swept = sweeps and _SWEEP.search(value) is not None
+    quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    if (swept or quoted) and not Path(value).exists():
+        return argument
+    return f"{key}={QuotedString(value, Quote.single).with_quotes()}"
 
 
 def compose_checked(folder: Path, overrides: Sequence[str], name: str = "config") -> DictConfig:
@@ -27,12 +70,13 @@ def compose_checked(folder: Path, overrides: Sequence[str], name: str = "config"
 
     Args:
         folder: the root of the config groups.
-        overrides: such as ``scenario=A`` or ``seed=1``.
+        overrides: such as ``scenario=A`` or ``seed=1``; see `quote_paths`.
         name: of the primary config.
 
     Raises:
         ConfigError: an override is no setting, or names a choice that isn't there.
     """
+    overrides = quote_paths(overrides)
     check_overrides(folder, overrides, name)
     with initialize_config_dir(str(folder.resolve()), version_base=_HYDRA_VERSION):
         config: DictConfig = compose(name, overrides=[*overrides])

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
+MOST_STAMP = 2**63 - 1  # nanoseconds that an int64 holds
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from lifelong_slam.errors import SourceError
 from lifelong_slam.files import atomic_write
 from lifelong_slam.geometry import from_quaternion, interpolate, to_quaternion
-from lifelong_slam.scan import NANOSECONDS
+from lifelong_slam.scan import MOST_STAMP, NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,11 @@ def read_tum(path: Path) -> Trajectory:
     """
     if not path.is_file():
         raise SourceError(f"no such trajectory file: {path}")
-    rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    try:
+        lines = path.read_text().splitlines()
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is not a TUM trajectory: it is not text") from error
+    rows = [line.split() for line in lines if line.strip()]
     rows = [row for row in rows if not row[0].startswith("#")]
     if not rows or any(len(row) != 8 for row in rows):
         raise SourceError(f"{path} is not a TUM trajectory: each row needs 8 numbers")
@@ -102,9 +106,19 @@ def format_seconds(stamp: int) -> str:
 
 
 def parse_seconds(text: str) -> int:
-    """Turn decimal seconds into nanoseconds without a float's loss of digits."""
+    """Turn decimal seconds into nanoseconds without a float's loss of digits.
+
+    Raises:
+        ValueError: it is no number, or beyond what int64 nanoseconds hold (292 years either way).
+    """
     if "e" in text.lower():
-        return round(float(text) * NANOSECONDS)
+        seconds = float(text)
+        if not abs(seconds) * NANOSECONDS < MOST_STAMP:
+            raise ValueError(f"{text} is no time in seconds")
+        return round(seconds * NANOSECONDS)
     whole, _, fraction = text.partition(".")
     sign = -1 if whole.startswith("-") else 1
-    return int(whole or "0") * NANOSECONDS + sign * int((fraction + "000000000")[:9])
+    stamp = int(whole or "0") * NANOSECONDS + sign * int((fraction + "000000000")[:9])
+    if abs(stamp) > MOST_STAMP:
+        raise ValueError(f"{text} s are more than 292 years")
+    return stamp

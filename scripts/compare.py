@@ -21,21 +21,17 @@ The tables are printed as well.
 Exit status: 0 done; 2 bad input or settings, said in one line; 130 stopped by Ctrl-C.
 """
 
+import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from command import run_command
 from eval.comparison.report import write_report
 from eval.comparison.runs import find_runs
 from eval.comparison.tables import make_tables
 from eval.comparison.writing import markdown, write_tables
-from lifelong_slam.config import check_value
 from lifelong_slam.errors import ConfigError, did_you_mean
 
 
@@ -70,21 +66,26 @@ def parse(arguments: Sequence[str]) -> Settings:
         ConfigError: an argument is no setting, no runs are named, or a value has the wrong type.
     """
     known = [*Settings.__annotations__]
-    try:
-        given = OmegaConf.to_container(OmegaConf.from_dotlist([*arguments]))
-    except (OmegaConfBaseException, YAMLError, ValueError) as error:
-        raise ConfigError(f"can't read the settings: {' '.join(str(error).split())}") from error
-    assert isinstance(given, dict)
-    for key in map(str, given):
+    given = dict.fromkeys(known, "")
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if not equals:
+            raise ConfigError(f"can't read the settings: '{argument}' is not key=value")
         if key not in known:
             raise ConfigError(f"there is no setting '{key}'.{did_you_mean(key, known)} See --help")
-    if not given.get("runs"):
+        given[key] = value
+    runs = _folders(given["runs"])
+    return Settings(runs, Path(given["out"]) if given["out"] else runs[0] / "comparison")
+
+
+def _folders(named: str) -> list[Path]:
+    """Return the folders that ``DIR`` or ``[DIR,DIR]`` names; quotes keep a comma within a name."""
+    if named in ("", "[]"):
         raise ConfigError("no runs are named: give runs=DIR; see --help")
-    named = given["runs"] if isinstance(given["runs"], list) else [given["runs"]]
-    runs = [Path(check_value("runs", folder, str)) for folder in named]
-    return Settings(
-        runs, Path(check_value("out", given.get("out", str(runs[0] / "comparison")), str))
-    )
+    if Path(named).exists() or not (named.startswith("[") and named.endswith("]")):
+        return [Path(named)]
+    names = next(csv.reader([named[1:-1]], skipinitialspace=True))
+    return [Path(name) for name in names]
 
 
 if __name__ == "__main__":

@@ -108,7 +108,7 @@ def show_results(record: "RunRecord", metrics: dict[str, Any], folder: Path) -> 
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in _rows(record, metrics):
         table.add_row(name, value)
-    Console().print(table)
+    Console(markup=False).print(table)
     print(f"Run folder: {folder}")
     verdict = metrics["run"]["verdict"]
     if verdict["reasons"]:

@@ -118,7 +118,7 @@ def show(verdicts: Sequence[Verdict], evidence: Evidence) -> None:
             table.add_row(
                 metric.title, number(found.headline), metric.unit, _BETTER[metric.less_is_better]
             )
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     warnings = [w for v in verdicts if v.measurement for w in v.measurement.warnings]
     for warning in dict.fromkeys(warnings):

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from console import fail
-from lifelong_slam.errors import LifelongSlamError
+from lifelong_slam.errors import LifelongSlamError, MapError
 from lifelong_slam.mapping.map_check import check_map
 from lifelong_slam.mapping.map_export import export_map, static_points
 from lifelong_slam.mapping.saved_map import SavedMap, Session
@@ -30,9 +30,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         return int(options.command(options))
-    except (LifelongSlamError, OSError) as error:
+    except OSError as error:
         fail(error)
-        return BAD_INPUT
+    except LifelongSlamError as error:
+        named = str(options.file) in str(error)
+        fail(error if named else MapError(f"{options.file}: {error}"))
+    return BAD_INPUT
 
 
 def parser() -> argparse.ArgumentParser:
@@ -183,7 +186,7 @@ def iso_time(nanoseconds: int) -> str:
 
 def show(facts: dict[str, Any]) -> None:
     """Print what is in a map as two tables."""
-    console = Console()
+    console = Console(markup=False)
     sessions = Table(box=None, pad_edge=False)
     for column in ("Session", "Started", "Source", "State"):
         sessions.add_column(column)

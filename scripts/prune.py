@@ -39,7 +39,7 @@ from rich.table import Table
 from command import CONF, run_command
 from eval.files import write_json
 from eval.vertices import Array, rmse, vertex_distances
-from lifelong_slam.config import build, check_value
+from lifelong_slam.config import build, check_value, one_line
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.graph.reduction import Reduction, State, reduce
 from lifelong_slam.io.g2o import read_g2o, write_g2o
@@ -96,7 +96,10 @@ def prune(settings: Settings, config: DictConfig, arguments: Sequence[str]) -> d
     graph = read_g2o(Path(settings.graph))
     judged = sorted(set(graph.poses) - isolated(graph))
     truth = read_truth(Path(settings.truth), judged) if settings.truth else None
-    result = reduce(graph, pruning, settings.keep, settings.robust)
+    try:
+        result = reduce(graph, pruning, settings.keep, settings.robust)
+    except RuntimeError as error:  # GTSAM's, of numbers that it can't solve for
+        raise ConfigError(f"{settings.graph} can't be optimised: {one_line(error)}") from error
     if settings.out:
         if not result.complete:
             raise ConfigError(
@@ -179,7 +182,7 @@ def show(facts: dict[str, Any]) -> None:
         values = [state[key] for state in states]
         if values[0] is not None:
             table.add_row(name, *(format(value, form) for value in values))
-    console = Console()
+    console = Console(markup=False)
     console.print(table)
     console.print(
         f"Mean distance from the optimum: {facts['moved_staying_m']:.4f} m (vertices that stay),"

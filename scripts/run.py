@@ -27,7 +27,7 @@ from lifelong_slam.assessment import Status, assess
 from lifelong_slam.config import build, check_value
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.mapping.session import MapSession
-from lifelong_slam.overrides import check_overrides
+from lifelong_slam.overrides import check_overrides, quote_paths
 from lifelong_slam.provenance import describe_run, seed_everything
 from lifelong_slam.run_folder import link_reference_map, write_run
 from lifelong_slam.runner import RunRecord, ViewerObserver, run, stop_on_signals
@@ -170,6 +170,7 @@ def main() -> int:
     """Run one job or a sweep, and turn whatever went wrong into one line and an exit status."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # have Hydra raise errors instead of printing them
     try:
+        sys.argv[1:] = quote_paths(sys.argv[1:])
         check_command_line()
         prepare_launcher()
         job()

@@ -86,7 +86,8 @@ def test_folders_of_evaluate_are_compared_by_their_names(sweep, capsys):
         (["run=x"], "Did you mean 'runs'"),
         (["runs=nowhere"], "no such folder of runs: nowhere"),
         (["runs=."], "no finished run below"),
-        (["runs=[a"], "can't read the settings"),
+        (["runs=[a"], "no such folder of runs: [a"),
+        (["runs"], "'runs' is not key=value"),
         (["runs={a: 1}"], "runs: "),
     ],
 )

@@ -196,7 +196,7 @@ LOPSIDED = codec.pack_matrix(np.eye(6) + np.eye(6, k=1) * 0.1)
         ),
         (
             [("UPDATE edges SET T_source_target = ? WHERE id = 1", (NOT_FINITE,))],
-            "edge 1: not a rigid",
+            "edges 1, T_source_target: it is not finite",
         ),
         (
             [("UPDATE edges SET covariance = ? WHERE id = 3", (INDEFINITE,))],

@@ -5,27 +5,58 @@ A run folder is one that `scripts/run.py` leaves, alone or as a job of a multiru
 nothing but `metrics.json` will do; its choices are then taken from there.
 """
 
-import json
+import math
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from io import StringIO
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, TypeVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from pydantic import BaseModel
 
-from eval.errors import FileError
+from eval.errors import FileError, readable
+from eval.files import read_json, read_yaml_text
 
 T = TypeVar("T")
 
+_Vector = tuple[float, float, float]
 _SWEEP = "multirun.yaml"
 _NO_FOLDER = "it left no folder: it failed or was not started"
-_UNREADABLE = (OSError, ValueError, YAMLError, OmegaConfBaseException, HydraException)
+_MOST_JOBS = 100_000  # of a multirun
+
+
+class _Headline(BaseModel):
+    title: str
+    unit: str | None
+    less_is_better: bool | None
+
+
+class _Alignment(BaseModel):
+    method: str
+    rotation: tuple[_Vector, _Vector, _Vector]
+    translation_m: _Vector
+    scale: float
+
+
+class _Section(BaseModel):
+    headlines: dict[str, _Headline] = {}
+    alignment: _Alignment | None = None
+
+
+class _Metrics(BaseModel):
+    """What comparisons read of metrics.json, to be checked; see `docs/metrics.md`."""
+
+    run: dict[str, Any] = {}
+    trajectory: _Section = _Section()
+    map: _Section = _Section()
+    graph: _Section = _Section()
+    resources: _Section = _Section()
 
 
 @dataclass(frozen=True)
@@ -52,7 +83,7 @@ class Run:
             return self.choices[key]
         try:
             value = OmegaConf.select(self.config, key)
-        except OmegaConfBaseException:  # it refers to what isn't there outside of a run
+        except (OmegaConfBaseException, RecursionError):  # it refers to what is only there in a run
             value = None
         return self.overrides.get(key) if value is None else str(value)
 
@@ -73,7 +104,7 @@ class Run:
         for key in keys:
             value = value.get(key) if isinstance(value, Mapping) else None
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return float(value) if is_number else None
+        return float(value) if is_number and abs(value) <= sys.float_info.max else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,21 +162,25 @@ def find_runs(roots: Sequence[Path]) -> Runs:
 
 def read_run(folder: Path) -> Run | Missing:
     """Read a run folder, or say why there is nothing to compare."""
-    try:
-        metrics = json.loads((folder / "metrics.json").read_text())
-        info = metrics.get("run", {})
-        hydra = _load(folder / ".hydra" / "hydra.yaml")
-        choices = OmegaConf.select(hydra, "hydra.runtime.choices") or info.get("choices", {})
-        lines = _lines(folder / ".hydra" / "overrides.yaml", info.get("command_line", []))
-        config = _load(folder / ".hydra" / "config.yaml")
-    except FileNotFoundError:
+    path = folder / "metrics.json"
+    if not path.is_file():
         return Missing(str(folder), "it has no metrics.json: it failed, was killed, or still runs")
-    except (*_UNREADABLE, TypeError, AttributeError) as error:
+    try:
+        with readable(folder, "run folder"):
+            metrics = read_json(path)
+            _Metrics.model_validate(metrics)
+            info = metrics.get("run", {})
+            hydra = _load(folder / ".hydra" / "hydra.yaml")
+            choices = OmegaConf.select(hydra, "hydra.runtime.choices") or info.get("choices", {})
+            lines = _lines(folder / ".hydra" / "overrides.yaml", info.get("command_line", []))
+            config = _load(folder / ".hydra" / "config.yaml")
+            groups = {str(g): str(c) for g, c in choices.items() if "/" not in str(g)}
+            overrides = _overrides(lines)
+    except (FileError, OSError) as error:
         return Missing(str(folder), f"it can't be read: {' '.join(str(error).split())}")
     if info.get("interrupted"):
         return Missing(str(folder), "it was stopped early")
-    groups = {str(g): str(c) for g, c in choices.items() if "/" not in str(g)}
-    return Run(folder, _overrides(lines), groups, config, metrics)
+    return Run(folder, overrides, groups, config, metrics)
 
 
 def is_seed(key: str) -> bool:
@@ -175,14 +210,18 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _load(file: Path) -> DictConfig:
-    config = OmegaConf.load(file) if file.is_file() else OmegaConf.create()
+    config = _yaml(file) if file.is_file() else OmegaConf.create()
     if not isinstance(config, DictConfig):
         raise ValueError(f"{file} is no mapping")
     return config
 
 
 def _lines(file: Path, otherwise: Sequence[str]) -> list[str]:
-    return [str(line) for line in OmegaConf.load(file)] if file.is_file() else [*otherwise]
+    return [str(line) for line in (_yaml(file) if file.is_file() else otherwise)]
+
+
+def _yaml(file: Path) -> Any:
+    return OmegaConf.load(StringIO(read_yaml_text(file)))
 
 
 def _overrides(lines: Sequence[str]) -> dict[str, str | None]:
@@ -194,9 +233,11 @@ def _overrides(lines: Sequence[str]) -> dict[str, str | None]:
 def _jobs_without_folder(sweep: Path) -> list[Missing]:
     """Name the jobs of a multirun that didn't leave a folder: `run.py` removes what failed at once."""
     try:
-        jobs = _jobs(_load(sweep))
-        there = {int(_load(file).hydra.job.num) for file in sweep.parent.rglob(".hydra/hydra.yaml")}
-    except (*_UNREADABLE, AttributeError) as error:
+        with readable(sweep, "multirun's config"):
+            jobs = _jobs(_load(sweep))
+            folders = sweep.parent.rglob(".hydra/hydra.yaml")
+            there = {int(_load(file).hydra.job.num) for file in folders}
+    except (FileError, OSError) as error:
         text = " ".join(str(error).split())
         return [Missing(str(sweep), f"the jobs of this multirun can't be counted: {text}")]
     return [
@@ -218,9 +259,12 @@ def _jobs(config: DictConfig) -> list[tuple[str, ...]]:
     for override in OverridesParser.create().parse_overrides(lines):
         if override.is_sweep_override():
             key = override.get_key_element()
-            values.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+            swept = islice(override.sweep_string_iterator(), _MOST_JOBS + 1)
+            values.append([f"{key}={value}" for value in swept])
         else:
             values.append([str(override.input_line)])
+    if math.prod(map(len, values)) > _MOST_JOBS:
+        raise ValueError(f"it has more than {_MOST_JOBS} jobs")
     return list(product(*values))
 
 

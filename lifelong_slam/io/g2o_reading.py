@@ -25,6 +25,7 @@ from lifelong_slam.result import Edge, EdgeKind, GraphSnapshot, Prior
 Array = NDArray[np.float64]
 logger = logging.getLogger(__name__)
 
+_LARGEST = 1e30  # beyond it, products overflow
 _MOST_ID = 2**63 - 1  # of a vertex
 _LANDMARKS = ("XY", "XYZ", "PLANE", "POINT", "LINE", "BEARING", "LANDMARK", "PROJECT", "CAM")
 
@@ -260,8 +261,8 @@ def _row(line: int, tag: str, fields: list[str], record: _Record, kind: EdgeKind
         numbers = [float(field) for field in fields[record.ids :]]
     except ValueError as error:
         raise _no_number(line, tag, fields, error) from error
-    if not np.isfinite(numbers).all():
-        raise LineError(line, f"not a valid {tag}: numbers must be finite")
+    if not (np.abs(numbers) < _LARGEST).all():
+        raise LineError(line, f"not a valid {tag}: numbers must be finite, and below {_LARGEST:g}")
     return _Row(line, ids, numbers, kind)
 
 

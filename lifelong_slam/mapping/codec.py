@@ -19,12 +19,19 @@ from collections.abc import Mapping
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
+from pydantic import NonNegativeInt, TypeAdapter, ValidationError
+
+from formats.bounded import inflate
+
+Layout = Mapping[str, tuple[str, tuple[int, ...]]]
 
 POINT_RESOLUTION = 0.001  # metres
 _EXTENT = 1 << 21  # steps that a cloud may extend over along an axis, 63 bits for three of them
 _LEVEL = 3
 _CHECKSUM = struct.Struct("<I")
 _LENGTH = struct.Struct("<I")
+_HEADER = TypeAdapter(dict[str, tuple[str, list[NonNegativeInt]]])
+_POINTS: Layout = {"low": ("<i8", ()), "codes": ("<i8", ())}
 # Masks that spread 21 bits to every third of 63, each after a shift by the number beside it.
 _SPREAD = (
     (32, 0x001F00000000FFFF),
@@ -55,20 +62,30 @@ def pack(arrays: Mapping[str, NDArray[np.generic]]) -> bytes:
     return _sealed(zstandard.ZstdCompressor(level=_LEVEL).compress(plain))
 
 
-def unpack(blob: bytes) -> dict[str, NDArray[np.generic]]:
+def unpack(blob: bytes, layout: Layout) -> dict[str, NDArray[np.generic]]:
     """Undo `pack`.
 
+    Args:
+        blob: what it returned.
+        layout: what it must hold, type and shape of a row of each array by its name.
+
     Raises:
-        ValueError: the blob is damaged.
+        ValueError: the blob is damaged, or holds something else.
     """
-    try:
-        plain = zstandard.ZstdDecompressor().decompress(_opened(blob))
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from error
-    position = _LENGTH.size + _LENGTH.unpack_from(plain)[0]
+    plain = memoryview(inflate(_opened(blob), "zstd"))
+    header, position = _header(plain)
+    if header.keys() != layout.keys():
+        raise ValueError(
+            f"it holds {', '.join(header)[:80] or 'nothing'} instead of {', '.join(layout)}"
+        )
     arrays = {}
-    for name, (dtype, shape) in json.loads(plain[_LENGTH.size : position]).items():
-        kind, count = np.dtype(dtype), math.prod(shape)
+    for name, (code, shape) in header.items():
+        kind, row = np.dtype(layout[name][0]), layout[name][1]
+        if (code, shape[1:]) != (kind.str, [*row]):
+            raise ValueError(f"its array '{name}' is {code} {shape}")
+        count = math.prod(shape)
+        if count * kind.itemsize > len(plain) - position:
+            raise ValueError(f"its array '{name}' isn't whole")
         planes = np.frombuffer(plain, np.uint8, count * kind.itemsize, position)
         position += count * kind.itemsize
         rows = planes.reshape(kind.itemsize, count).T.copy(order="C")
@@ -100,10 +117,14 @@ def unpack_points(blob: bytes) -> NDArray[np.float32]:
     Raises:
         ValueError: the blob is damaged.
     """
-    arrays = unpack(blob)
+    arrays = unpack(blob, _POINTS)
     codes, low = arrays["codes"].astype(np.int64), arrays["low"].astype(np.int64)
-    steps = np.stack([_gather(codes >> axis) for axis in range(3)], axis=1) + low
-    return np.asarray(steps * POINT_RESOLUTION, dtype=np.float32)
+    if low.shape != (3,):
+        raise ValueError("its cloud has no corner")
+    points = np.empty((len(codes), 3), np.float32)
+    for axis in range(3):  # one by one, to take less memory
+        points[:, axis] = (_gather(codes >> axis) + low[axis]) * POINT_RESOLUTION
+    return points
 
 
 def pack_matrix(matrix: NDArray[np.float64]) -> bytes:
@@ -124,11 +145,26 @@ def unpack_matrix(blob: bytes, size: int) -> NDArray[np.float64]:
     return np.frombuffer(_opened(blob), "<f8").astype(np.float64).reshape(size, size)
 
 
+def _header(plain: memoryview) -> tuple[dict[str, tuple[str, list[int]]], int]:
+    """Return type and shape of each array by name, and where their bytes begin."""
+    try:
+        end = _LENGTH.size + int(_LENGTH.unpack_from(plain)[0])
+        if end > len(plain):
+            raise ValueError("its header isn't whole")
+        return _HEADER.validate_json(bytes(plain[_LENGTH.size : end])), end
+    except struct.error as error:
+        raise ValueError("its header isn't whole") from error
+    except ValidationError as error:
+        raise ValueError(f"its header is damaged: {error.errors()[0]['msg']}") from error
+
+
 def _sealed(data: bytes) -> bytes:
     return _CHECKSUM.pack(zlib.crc32(data)) + data
 
 
 def _opened(blob: bytes) -> bytes:
+    if not isinstance(blob, bytes):
+        raise ValueError("it is no blob")
     data = blob[_CHECKSUM.size :]
     if blob[: _CHECKSUM.size] != _CHECKSUM.pack(zlib.crc32(data)):
         raise ValueError("the checksum is wrong")

@@ -17,6 +17,7 @@ from lifelong_slam.mapping.map_reading import (
     unpack_pose,
     unpack_scans,
     unpack_support,
+    unpack_voxels,
 )
 from lifelong_slam.mapping.saved_map import Array, SavedMap
 from lifelong_slam.mapping.store import MapStore
@@ -30,7 +31,7 @@ _BLOBS: dict[str, dict[str, Callable[[bytes], Any]]] = {
     "edges": {"T_source_target": unpack_pose, "covariance": unpack_covariance},
     "features": {"points": codec.unpack_points},
     "unsettled": {"points": codec.unpack_points},
-    "submaps": {"voxels": codec.unpack},
+    "submaps": {"voxels": unpack_voxels},
     "scans": {"poses": unpack_scans},
     "places": {"points": codec.unpack_points},
 }

@@ -23,6 +23,14 @@ _OLDEST_VERSION = (
 )
 _SECONDS_TO_WAIT = 0.5  # for others, who may need the file for a moment only
 
+# What no map has, and what can make SQLite compute without an end, or give values of another type.
+_FOREIGN = """
+SELECT name FROM sqlite_schema WHERE type NOT IN ('table', 'index')
+UNION ALL SELECT name FROM pragma_table_list
+    WHERE schema = 'main' AND name NOT LIKE 'sqlite%' AND (type <> 'table' OR NOT strict)
+UNION ALL SELECT t.name || '.' || c.name FROM pragma_table_list AS t, pragma_table_xinfo(t.name) AS c
+    WHERE t.schema = 'main' AND t.name NOT LIKE 'sqlite%' AND (c.hidden OR NOT (c."notnull" OR c.pk))
+"""
 _EDGES = """
 CREATE TABLE edges (
     id INTEGER PRIMARY KEY,
@@ -240,8 +248,11 @@ def _check_header(path: Path) -> None:
     with errors_of(path), closing(_connect(path, mode)) as connection:
         (application,) = connection.execute("PRAGMA application_id").fetchone()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
+        foreign = connection.execute(_FOREIGN).fetchall()
     if application != _APPLICATION:
         raise MapError(f"{path} is not a map of lifelong_slam")
+    if foreign:
+        raise MapError(f"{path} is not a map of lifelong_slam: it has '{foreign[0][0]}'")
     if not _OLDEST_VERSION <= version <= _SCHEMA_VERSION:
         raise MapError(
             f"{path} has map format {version}; this version of lifelong_slam knows {_OLDEST_VERSION}"

@@ -1,5 +1,6 @@
 """How rows of a map file become a map."""
 
+import math
 import sqlite3
 from collections.abc import Callable, Iterator
 from typing import TypeVar
@@ -12,18 +13,34 @@ from lifelong_slam.geometry import exp
 from lifelong_slam.graph.removal import Removal
 from lifelong_slam.mapping import codec
 from lifelong_slam.mapping.keyframe import Keyframe
-from lifelong_slam.mapping.saved_map import Array, MapInfo, SavedMap, Scans, Session
+from lifelong_slam.mapping.saved_map import Array, Arrays, MapInfo, SavedMap, Scans, Session
+from lifelong_slam.mapping.submap import Submap
 from lifelong_slam.result import Edge
 
 _Decoded = TypeVar("_Decoded")
+
+_FARTHEST = 1e8  # metres
+_SCANS: codec.Layout = {"stamps": ("<i8", ()), "xi": ("<f8", (6,))}
+_SUPPORT: codec.Layout = {
+    "neighbours": ("<i8", ()),
+    "T_neighbour_vertex": ("<f8", (4, 4)),
+    "gains": ("<f8", (6, 6)),
+}
+_VOXELS: codec.Layout = {
+    "keys": ("<i8", ()),
+    "means": ("<f4", (3,)),
+    "weights": ("|u1", ()),
+    "scores": ("|i1", ()),
+}
 
 
 def read_map(db: sqlite3.Connection) -> SavedMap:
     """Read all of a map, inside a transaction.
 
     Raises:
-        MapError: a blob is damaged; the message names its table and row.
+        MapError: a blob is damaged, or a row names one that isn't there; the message names table and row.
     """
+    check_references(db)
     return SavedMap(
         info=read_info(db),
         sessions=list(_sessions(db)),
@@ -33,14 +50,23 @@ def read_map(db: sqlite3.Connection) -> SavedMap:
         rejected=frozenset(i for (i,) in db.execute("SELECT id FROM edges WHERE rejected")),
         removals=list(_removals(db)),
         scans=list(_scans(db)),
-        submaps=_column(db, "submaps", "voxels", codec.unpack),
+        submaps=_column(db, "submaps", "voxels", unpack_voxels),
         places=_column(db, "places", "points", codec.unpack_points),
     )
 
 
+def check_references(db: sqlite3.Connection) -> None:
+    """Raise MapError if a row names an entry of another table that isn't there."""
+    for table, row, referenced, _ in db.execute("PRAGMA foreign_key_check"):
+        raise MapError(f"{table} {row} names an entry that is not in {referenced}")
+
+
 def unpack_pose(blob: bytes) -> Array:
     """Read a (4, 4) pose; raises ValueError if it is damaged."""
-    return codec.unpack_matrix(blob, 4)
+    T = codec.unpack_matrix(blob, 4)
+    if not (np.abs(T) < _FARTHEST).all():
+        raise ValueError("it is not finite, or off the Earth")
+    return T
 
 
 def unpack_covariance(blob: bytes) -> Array:
@@ -50,13 +76,25 @@ def unpack_covariance(blob: bytes) -> Array:
 
 def unpack_scans(blob: bytes) -> tuple[NDArray[np.int64], Array]:
     """Read (N,) stamps and (N, 4, 4) poses; raises ValueError if they are damaged."""
-    arrays = codec.unpack(blob)
-    return arrays["stamps"].astype(np.int64), exp(arrays["xi"].astype(np.float64))
+    arrays = codec.unpack(blob, _SCANS)
+    stamps, xi = arrays["stamps"].astype(np.int64), arrays["xi"].astype(np.float64)
+    if len(stamps) != len(xi):
+        raise ValueError("stamps and poses differ in number")
+    return stamps, exp(xi)
+
+
+def unpack_voxels(blob: bytes) -> Arrays:
+    """Read the arrays of a `Submap`; raises ValueError if they are damaged."""
+    arrays = codec.unpack(blob, _VOXELS)
+    Submap(**arrays)  # type: ignore[arg-type]
+    if not (np.abs(arrays["means"]) < _FARTHEST).all():
+        raise ValueError("a mean is not finite, or off the Earth")
+    return arrays
 
 
 def unpack_support(blob: bytes) -> tuple[NDArray[np.int64], Array, Array]:
     """Read (k,) neighbours, (k, 4, 4) poses and (k, 6, 6) gains; raises ValueError if damaged."""
-    arrays = codec.unpack(blob)
+    arrays = codec.unpack(blob, _SUPPORT)
     neighbours = arrays["neighbours"].astype(np.int64)
     poses = arrays["T_neighbour_vertex"].astype(np.float64)
     gains = arrays["gains"].astype(np.float64)
@@ -68,10 +106,14 @@ def unpack_support(blob: bytes) -> tuple[NDArray[np.int64], Array, Array]:
 
 def read_info(db: sqlite3.Connection) -> MapInfo:
     """Read what holds for a map as a whole; raises MapError if it is damaged."""
-    T_base_sensor = _column(db, "map", "T_base_sensor", unpack_pose)[1]
-    row = db.execute("SELECT sensor, voxel_size, created, version FROM map").fetchone()
-    sensor, voxel_size, created, version = row
-    return MapInfo(sensor, T_base_sensor, voxel_size, created, version)
+    poses = [*_column(db, "map", "T_base_sensor", unpack_pose).values()]
+    rows = db.execute("SELECT sensor, voxel_size, created, version FROM map").fetchall()
+    if len(rows) != 1:
+        raise MapError(f"table map has {len(rows)} rows instead of one")
+    sensor, voxel_size, created, version = rows[0]
+    if not 0 < voxel_size < math.inf:
+        raise MapError(f"map 1: the edge of a voxel is {voxel_size} m")
+    return MapInfo(sensor, poses[0], voxel_size, created, version)
 
 
 def _sessions(db: sqlite3.Connection) -> Iterator[Session]:

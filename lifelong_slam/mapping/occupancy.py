@@ -39,7 +39,7 @@ def occupancy_grid(points: NDArray[np.float32], sensors: Array, resolution: floa
     """
     if not len(points):
         raise MapError("there are no static points to make an occupancy grid of")
-    width, length = np.ptp(points[:, :2], axis=0) / resolution
+    width, length = np.ptp(points[:, :2], axis=0) / min(resolution, _GROUND_CELL)
     if width * length > _MOST_CELLS:
         raise MapError(
             f"{width:.0f} x {length:.0f} cells are too many: choose a coarser resolution"

@@ -77,7 +77,8 @@ def clean(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:
             counts.skipped[UNREADABLE] = unreadable
         counts.reordered = getattr(source, "reordered", 0)
     if counts.used == 0:
-        raise SourceError(f"no usable scans in this recording: {counts.summary()}")
+        where = getattr(source, "path", "this recording")
+        raise SourceError(f"no usable scans in {where}: {counts.summary()}")
 
 
 def _cleaned(source: Iterable[Scan], counts: InputCounts) -> Iterator[Scan]:

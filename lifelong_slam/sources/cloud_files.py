@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.pcd import read_pcd
+from formats.ply import read_ply
 from lifelong_slam.errors import SourceError
 from lifelong_slam.sources.bin_layout import KITTI_COLUMNS
-from lifelong_slam.sources.pcd import read_pcd
-from lifelong_slam.sources.ply import read_ply
 from lifelong_slam.sources.point_times import is_time_field
 from lifelong_slam.sources.pointcloud2 import Cloud
 

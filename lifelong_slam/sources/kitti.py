@@ -21,6 +21,7 @@ from lifelong_slam.trajectory import Trajectory
 _log = logging.getLogger(__name__)
 
 _SCAN_FOLDERS = ("velodyne", "velodyne_points/data")
+_DIGITS = 19  # from which on a number may exceed int64
 _TIME_FILES = ("times.txt", "velodyne_points/timestamps.txt")
 
 
@@ -143,7 +144,7 @@ def _find_sequence(path: Path, sequence: str | None) -> Path:
 
 def _row_numbers(files: list[Path]) -> NDArray[np.int64]:
     """Return each file's row in times and poses: KITTI numbers files by it, and a few are lost."""
-    if all(file.stem.isdecimal() for file in files):
+    if all(file.stem.isdecimal() and len(file.stem) < _DIGITS for file in files):
         return np.array([int(file.stem) for file in files], dtype=np.int64)
     return np.arange(len(files), dtype=np.int64)
 

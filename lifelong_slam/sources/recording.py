@@ -10,6 +10,7 @@ from weakref import finalize
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
+from formats.bags import check_chunks, open_bag
 from lifelong_slam.errors import SourceError
 from lifelong_slam.sources.bag_files import bag_paths, storage_files
 from lifelong_slam.sources.channel import ROS1, Topic
@@ -53,6 +54,8 @@ class IndexedRecording:
         self._paths = paths
         self._ros1 = all(path.suffix == ".bag" for path in paths)
         self._defaults = default_typestore(self._ros1)
+        for path in paths:
+            check_chunks(path)
         with self._open() as reader:
             self._store = reader.typestore
             self._topics = {
@@ -98,7 +101,7 @@ class IndexedRecording:
         return self._store.deserialize_cdr(raw, msgtype)
 
     def _open(self) -> AnyReader:
-        return AnyReader(self._paths, default_typestore=self._defaults)
+        return open_bag(self._paths, self._defaults)
 
 
 def open_recording(path: Path) -> Recording:

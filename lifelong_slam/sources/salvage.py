@@ -1,5 +1,6 @@
 """Reading of damaged bags: whatever is whole, from the start on, without an index."""
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -10,6 +11,8 @@ from rosbags.typesys.store import Typestore
 from lifelong_slam.sources import salvage_db3, salvage_mcap, salvage_ros1
 from lifelong_slam.sources.channel import Channel, Topic
 from lifelong_slam.sources.typestores import merged_typestore
+
+_log = logging.getLogger(__name__)
 
 Walk = Callable[[Path], Iterator[tuple[Channel, int, bytes]]]
 
@@ -68,8 +71,11 @@ class SalvagedRecording:
 
     def _walk(self) -> Iterator[tuple[Channel, int, bytes]]:
         for path in self._paths:
-            if walk := _format(path):
-                yield from walk(path)
+            walk = _format(path)
+            try:
+                yield from walk(path) if walk else ()
+            except Exception as error:  # damaged files break their parsers in any way
+                _log.debug("%s: end of what is readable: %r", path, error)
 
 
 def _format(path: Path) -> Walk | None:

@@ -3,12 +3,11 @@
 import logging
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import zstandard
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -18,14 +17,15 @@ from mcap.records import Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.typesys.msg import normalize_msgtype
 
+from formats.bags import MCAP_MAGIC
+from formats.bounded import Inflater
 from lifelong_slam.sources.channel import CDR, Channel
 
 _log = logging.getLogger(__name__)
 
-MAGIC = b"\x89MCAP0\r\n"
+MAGIC = MCAP_MAGIC
 
-
-_CUT = (McapError, struct.error, UnicodeDecodeError, MemoryError)
+_CUT = (McapError, struct.error, ValueError, MemoryError)
 
 
 def walk(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
@@ -59,52 +59,47 @@ def stated_count(path: Path) -> int:
 def _records(path: Path) -> Iterator[McapRecord]:
     """Yield the records of a file up to where it is cut, those inside chunks as well."""
     end = len(MAGIC)
+    inflater = Inflater(path.stat().st_size)
     with path.open("rb") as file:
         reader = StreamReader(_WholeReads(file), emit_chunks=True)
         try:
             for record in reader.records:
                 end = file.tell()
                 if isinstance(record, Chunk):
-                    yield from _inside(record, path)
+                    yield from _inside(record, path, inflater)
                 else:
                     yield record
         except _CUT as error:
             _log.debug("%s: end of what is readable: %r", path, error)
             file.seek(end)
-            yield from _inside_cut_chunk(file)
+            yield from _inside_cut_chunk(file, inflater)
 
 
-def _inside(chunk: Chunk, path: Path) -> list[McapRecord]:
+def _inside(chunk: Chunk, path: Path, inflater: Inflater) -> list[McapRecord]:
     try:
-        return list(breakup_chunk(chunk, validate_crc=True))
-    except Exception as error:  # each compression has its own family of errors
+        return list(breakup_chunk(_inflated(chunk, inflater), validate_crc=True))
+    except Exception as error:  # damaged records raise whatever the parser met first
         _log.warning("%s: a corrupt chunk of %d bytes left out: %s", path, len(chunk.data), error)
         return []
 
 
-def _inside_cut_chunk(file: BinaryIO) -> Iterator[McapRecord]:
+def _inside_cut_chunk(file: BinaryIO, inflater: Inflater) -> Iterator[McapRecord]:
     """Yield the whole records of a last chunk whose end is missing, if it is a chunk."""
     stream = ReadDataStream(BytesIO(file.read()))
     try:
         opcode, _ = stream.read1(), stream.read8()
         if opcode != Opcode.CHUNK:
             return
-        inner = BytesIO(_inflated(Chunk.read(stream)))
+        inner = BytesIO(_inflated(Chunk.read(stream), inflater).data)
         yield from StreamReader(_WholeReads(inner), skip_magic=True).records
     except _CUT as error:
         _log.debug("end of the last chunk: %r", error)
 
 
-def _inflated(chunk: Chunk) -> bytes:
-    """Decompress what is there of a chunk."""
-    try:
-        if chunk.compression == "zstd":
-            return bytes(zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data))
-        if chunk.compression == "lz4":
-            return bytes(LZ4FrameDecompressor().decompress(chunk.data))
-    except (zstandard.ZstdError, RuntimeError):
-        return b""
-    return bytes(chunk.data)
+def _inflated(chunk: Chunk, inflater: Inflater) -> Chunk:
+    """Return a chunk with what is there of its content decompressed."""
+    plain = inflater(chunk.data, chunk.compression, chunk.uncompressed_size)
+    return replace(chunk, compression="", data=plain)
 
 
 def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:

@@ -5,7 +5,6 @@ a header is a list of ``length, name=value``. Chunks hold, compressed, the recor
 and messages. A bag cut short lacks the index at its end, but its chunks up to the cut are there.
 """
 
-import bz2
 import logging
 import struct
 from collections.abc import Iterator
@@ -13,15 +12,16 @@ from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.typesys.msg import normalize_msgtype
 
+from formats.bags import ROS1_MAGIC
+from formats.bounded import Inflater
 from lifelong_slam.scan import NANOSECONDS
 from lifelong_slam.sources.channel import ROS1, Channel
 
 _log = logging.getLogger(__name__)
 
-MAGIC = b"#ROSBAG V2.0\n"
+MAGIC = ROS1_MAGIC
 
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _uint32 = struct.Struct("<I")
@@ -35,11 +35,12 @@ def walk(path: Path) -> Iterator[tuple[Channel, int, bytes]]:
     decompress is left out with a warning.
     """
     channels: dict[int, Channel] = {}
+    inflater = Inflater(path.stat().st_size)
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         for header, data in _records(file):
             if header["op"][0] == _CHUNK:
-                inner = BytesIO(_inflated(header.get("compression", b"none"), data, path))
+                inner = BytesIO(_inflated(header, data, path, inflater))
                 for inner_header, inner_data in _records(inner):
                     yield from _message(inner_header, inner_data, channels)
             else:
@@ -72,7 +73,10 @@ def _message(
         return
     number = _uint32.unpack(header["conn"])[0]
     if operation == _CONNECTION:
-        about = _fields(data)
+        try:
+            about = _fields(data)
+        except EOFError:
+            return
         channels[number] = Channel(
             topic="/" + "/".join(p for p in _text(header, "topic").split("/") if p),
             msgtype=str(normalize_msgtype(_text(about, "type"))),
@@ -84,17 +88,14 @@ def _message(
         yield channels[number], seconds * NANOSECONDS + nanoseconds, data
 
 
-def _inflated(compression: bytes, data: bytes, path: Path) -> bytes:
+def _inflated(header: dict[str, bytes], data: bytes, path: Path, inflater: Inflater) -> bytes:
     """Decompress a chunk as far as its bytes go; nothing of it where it is corrupt."""
     try:
-        if compression == b"bz2":
-            return bz2.BZ2Decompressor().decompress(data)
-        if compression == b"lz4":
-            return bytes(LZ4FrameDecompressor().decompress(data))
-    except (OSError, RuntimeError, EOFError) as error:
+        (size,) = _uint32.unpack(header.get("size", b""))
+        return inflater(data, _text(header, "compression"), size)
+    except (ValueError, struct.error) as error:
         _log.warning("%s: a corrupt chunk of %d bytes left out: %s", path, len(data), error)
         return b""
-    return data
 
 
 def _fields(header: bytes) -> dict[str, bytes]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lifelong_slam.errors import SourceError
 from lifelong_slam.geometry import from_quaternion
-from lifelong_slam.scan import NANOSECONDS
+from lifelong_slam.scan import MOST_STAMP, NANOSECONDS
 from lifelong_slam.trajectory import parse_seconds
 
 _FAR_FROM_ROTATION = 0.01
@@ -20,15 +20,7 @@ def read_times(path: Path) -> NDArray[np.int64]:
     Raises:
         SourceError: the file is missing, or a line is neither.
     """
-    stamps = []
-    for number, line in _lines(path):
-        try:
-            stamps.append(_date(line) if ":" in line else parse_seconds(line))
-        except ValueError:
-            raise SourceError(
-                f"{path}, line {number}: '{line[:40]}' is not a time in seconds"
-            ) from None
-    return np.array(stamps, dtype=np.int64)
+    return np.array([_stamp(path, number, line) for number, line in _lines(path)], dtype=np.int64)
 
 
 def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
@@ -54,7 +46,16 @@ def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64
         poses = from_quaternion(values[:, 1:4], values[:, 4:])
     except ValueError as error:
         raise SourceError(f"{path} holds a quaternion of length zero") from error
-    return np.array([parse_seconds(row[0]) for _, row in rows], dtype=np.int64), poses
+    return np.array([_stamp(path, number, row[0]) for number, row in rows], np.int64), poses
+
+
+def _stamp(path: Path, number: int, text: str) -> int:
+    try:
+        return _date(text) if ":" in text else parse_seconds(text)
+    except ValueError:
+        raise SourceError(
+            f"{path}, line {number}: '{text[:40]}' is not a time in seconds"
+        ) from None
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -97,4 +98,7 @@ def _from_kitti(path: Path, values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _date(text: str) -> int:
     whole, _, fraction = text.partition(".")
     moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-    return int(moment.timestamp()) * NANOSECONDS + int((fraction + "0" * 9)[:9])
+    stamp = int(moment.timestamp()) * NANOSECONDS + int((fraction + "0" * 9)[:9])
+    if abs(stamp) > MOST_STAMP:
+        raise ValueError(f"{text} is no time of a recording")
+    return stamp

@@ -4,18 +4,27 @@ Format: the Point Cloud Library's documentation, "The PCD file format". Written 
 readers at hand refuse, or corrupt memory on, the padding fields that PCL itself writes.
 """
 
+import math
 import struct
+from collections.abc import Collection
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from formats.bounded import check_plausible
+
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 
 
-def read_pcd(path: Path) -> NDArray[np.void]:
+def read_pcd(path: Path, wanted: Collection[str] | None = None) -> NDArray[np.void]:
     """Return (N,) records with the file's fields; padding fields are named ``_0``, ``_1``, ...
+
+    Args:
+        path: of the file.
+        wanted: fields that matter; text in the columns of others need not fit their types.
 
     Raises:
         ValueError: the file is damaged or cut short.
@@ -28,26 +37,62 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         count = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     encoding = header["DATA"][0].lower()
     if encoding == "ascii":
-        return read_rows(body, dtype, count)
+        return read_rows(body, dtype, count, wanted)
     if encoding == "binary":
-        return np.frombuffer(body, dtype, count)
+        return read_records(body, dtype, count)
     if encoding == "binary_compressed":
         return _compressed(body, dtype, count)
     raise ValueError(f"DATA {encoding} is not a PCD encoding")
 
 
-def read_rows(text: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """Parse `count` rows of numbers in columns.
+def read_rows(
+    text: bytes, dtype: np.dtype[np.void], count: int, wanted: Collection[str] | None = None
+) -> NDArray[np.void]:
+    """Parse `count` rows of numbers in columns, those of the wanted fields or of all.
 
     Raises:
         ValueError: there are fewer rows, or a row doesn't fit.
     """
     if count == 0:
         return np.empty(0, dtype)
-    rows = np.loadtxt(BytesIO(text), dtype, comments=None, max_rows=count, ndmin=1)
+    if not 0 < 2 * count <= len(text) + 1:  # a digit and what parts it from the next
+        raise ValueError(f"{count} points aren't in {len(text)} bytes of text")
+    dtype, columns = _wanted_columns(dtype, wanted)
+    rows = np.loadtxt(BytesIO(text), dtype, comments=None, max_rows=count, ndmin=1, usecols=columns)
     if len(rows) != count:
         raise ValueError(f"{len(rows)} of {count} rows of points are there")
     return rows
+
+
+def _wanted_columns(
+    dtype: np.dtype[np.void], wanted: Collection[str] | None
+) -> tuple[np.dtype[np.void], list[int] | None]:
+    """Return the type of the wanted fields and the columns of text that they are in."""
+    if wanted is None:
+        return dtype, None
+    fields: list[tuple[str, np.dtype[Any]]] = []
+    columns: list[int] = []
+    first = 0
+    for name in dtype.names or ():
+        size = math.prod(dtype[name].shape)
+        if name in wanted:
+            fields.append((name, dtype[name]))
+            columns += range(first, first + size)
+        first += size
+    return np.dtype(fields), columns
+
+
+def read_records(
+    body: bytes | memoryview, dtype: np.dtype[np.void], count: int
+) -> NDArray[np.void]:
+    """Return the first `count` records of a binary body.
+
+    Raises:
+        ValueError: there are fewer.
+    """
+    if not 0 <= count * dtype.itemsize <= len(body):
+        raise ValueError(f"{count} points of {dtype.itemsize} bytes aren't in {len(body)} bytes")
+    return np.frombuffer(body, dtype, count)
 
 
 def _split(data: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -82,8 +127,11 @@ def _record_type(header: dict[str, list[str]]) -> np.dtype[np.void]:
 def _compressed(body: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Decode a binary_compressed body: all of the first field, all of the second, and so on."""
     size, full = struct.unpack_from("<II", body)
-    if len(body) < 8 + size or full < count * dtype.itemsize:
+    if len(body) < 8 + size:
         raise ValueError(f"{len(body)} of {8 + size} bytes of points are there")
+    check_plausible(full, size)
+    if not 0 <= count * dtype.itemsize <= full:
+        raise ValueError(f"{count} points of {dtype.itemsize} bytes aren't in {full} bytes")
     flat = _decompress_lzf(body[8 : 8 + size], full)
     records, position = np.empty(count, dtype), 0
     for name in dtype.names or ():
@@ -115,6 +163,8 @@ def _decompress_lzf(data: bytes, size: int) -> bytes:
         while len(piece) < length + 2:  # the reference reaches into what it produces
             piece += piece[: length + 2 - len(piece)]
         out += piece
+        if len(out) > size:
+            break
     if len(out) != size:
         raise ValueError("its compressed data are corrupt")
     return bytes(out)
