@@ -24,6 +24,7 @@ from eval.errors import FileError
 T = TypeVar("T")
 
 _SWEEP = "multirun.yaml"
+_PREVIOUS = ".previous"  # where a run puts what an earlier one left in its folder
 _NO_FOLDER = "it left no folder: it failed or was not started"
 _UNREADABLE = (OSError, ValueError, YAMLError, OmegaConfBaseException, HydraException)
 
@@ -119,7 +120,7 @@ def find_runs(roots: Sequence[Path]) -> Runs:
             finished.append(found)
         else:
             missing.append(found)
-    for sweep in _unique(file for root in roots for file in sorted(root.rglob(_SWEEP))):
+    for sweep in _unique(file for root in roots for file in sorted(_below(root, _SWEEP))):
         missing += _jobs_without_folder(sweep)
     newest, earlier = _newest(finished)
     if not newest:
@@ -142,6 +143,8 @@ def read_run(folder: Path) -> Run | Missing:
         return Missing(str(folder), "it has no metrics.json: it failed, was killed, or still runs")
     except (*_UNREADABLE, TypeError, AttributeError) as error:
         return Missing(str(folder), f"it can't be read: {' '.join(str(error).split())}")
+    if config and info.get("id") != config.get("run_id"):
+        return Missing(str(folder), "config and metrics.json are of different runs")
     if info.get("interrupted"):
         return Missing(str(folder), "it was stopped early")
     groups = {str(g): str(c) for g, c in choices.items() if "/" not in str(g)}
@@ -160,9 +163,16 @@ def differing(runs: Sequence[Run]) -> list[str]:
 
 
 def _run_folders(root: Path) -> Iterator[Path]:
-    with_metrics = {file.parent for file in root.rglob("metrics.json")}
-    with_config = {file.parent.parent for file in root.rglob(".hydra/hydra.yaml")}
+    with_metrics = {file.parent for file in _below(root, "metrics.json")}
+    with_config = {file.parent.parent for file in _below(root, ".hydra/hydra.yaml")}
     yield from sorted(with_metrics | with_config, key=_natural)
+
+
+def _below(root: Path, pattern: str) -> Iterator[Path]:
+    """Yield the files below a folder that fit a pattern, but for those of runs that were set aside."""
+    for file in root.rglob(pattern):
+        if not any(part.startswith(_PREVIOUS) for part in file.relative_to(root).parts):
+            yield file
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -195,7 +205,8 @@ def _jobs_without_folder(sweep: Path) -> list[Missing]:
     """Name the jobs of a multirun that didn't leave a folder: `run.py` removes what failed at once."""
     try:
         jobs = _jobs(_load(sweep))
-        there = {int(_load(file).hydra.job.num) for file in sweep.parent.rglob(".hydra/hydra.yaml")}
+        configs = _below(sweep.parent, ".hydra/hydra.yaml")
+        there = {int(_load(file).hydra.job.num) for file in configs}
     except (*_UNREADABLE, AttributeError) as error:
         text = " ".join(str(error).split())
         return [Missing(str(sweep), f"the jobs of this multirun can't be counted: {text}")]
