@@ -28,6 +28,10 @@ class MapError(LifelongSlamError):
     """A saved map is missing, damaged, in use, of another kind, or doesn't hold what is asked for."""
 
 
+class IncompleteError(LifelongSlamError):
+    """A run came to its end, but not all that it leaves behind could be written."""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known name nearest to `name`, or an empty string."""
     close = get_close_matches(name, sorted(known), n=1)

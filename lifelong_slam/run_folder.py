@@ -8,7 +8,9 @@ X = `T_base_sensor` each pose becomes ``X T_map_sensor(i) X^-1`` and each map po
 import csv
 import io
 import os
+from collections.abc import Callable
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,11 +29,11 @@ from lifelong_slam.trajectory import Trajectory, format_seconds, write_tum
 if TYPE_CHECKING:
     from lifelong_slam.runner import RunRecord
 
-TRAJECTORY = "trajectory.tum"
-REFERENCE = "reference.tum"
-POSE_GRAPH = "pose_graph.g2o"
-REFERENCE_MAP = "reference_map.ply"
-TIMELINE = "timeline.csv"
+Writers = list[Callable[[], None]]
+
+TRAJECTORY, TRAJECTORY_BAG, REFERENCE = "trajectory.tum", "trajectory.bag", "reference.tum"
+MAP, MAP_BAG, REFERENCE_MAP = "map.ply", "map.bag", "reference_map.ply"
+POSE_GRAPH, TIMELINE = "pose_graph.g2o", "timeline.csv"
 _BLOCK = 1_000_000
 
 
@@ -41,31 +43,57 @@ def write_run(
     reference: Trajectory | None,
     T_base_sensor: NDArray[np.float64],
 ) -> None:
-    """Write trajectories, map, pose graph and timeline of a finished run.
+    """Write trajectories, map, pose graph and timeline of a finished run; see `run_writers`."""
+    for writers in run_writers(folder, record, reference, T_base_sensor):
+        for write in writers:
+            write()
+
+
+def run_writers(
+    folder: Path,
+    record: "RunRecord",
+    reference: Trajectory | None,
+    T_base_sensor: NDArray[np.float64],
+) -> tuple[Writers, Writers]:
+    """Return functions that write a file each of a finished run, roughly the smallest first.
 
     Args:
         folder: made if it is missing; each file in it is replaced as a whole.
         record: what the run produced, in the sensor's frame.
         reference: T_world_base of the source, written as it is, or None.
         T_base_sensor: (4, 4) pose of the sensor on the base.
+
+    Returns:
+        Writers of the files that a run is judged by, and of bags with the same content.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     result = record.result
     trajectory = trajectory_to_base(result.trajectory, T_base_sensor)
-    write_tum(folder / TRAJECTORY, trajectory)
-    topics = {"/trajectory/base/pose": trajectory}
-    if reference is None:
-        (folder / REFERENCE).unlink(missing_ok=True)
-    else:
-        write_tum(folder / REFERENCE, reference)
-        topics["/odometry/base/pose"] = reference
-    write_pose_bag(folder / "trajectory.bag", topics)
     points = points_to_base(result.map_points, T_base_sensor)
+    graph = graph_to_base(result.graph, T_base_sensor)
+    topics = {"/trajectory/base/pose": trajectory}
+    if reference is not None:
+        topics["/odometry/base/pose"] = reference
     stamp = int(trajectory.stamps[-1]) if len(trajectory) else 0
-    write_ply(folder / "map.ply", points)
-    write_cloud_bag(folder / "map.bag", "/map", "map", stamp, points)
-    write_g2o(folder / POSE_GRAPH, graph_to_base(result.graph, T_base_sensor))
-    write_timeline(folder / TIMELINE, record.timeline)
+    return (
+        [
+            partial(write_tum, folder / TRAJECTORY, trajectory),
+            partial(write_timeline, folder / TIMELINE, record.timeline),
+            partial(_write_reference, folder / REFERENCE, reference),
+            partial(write_g2o, folder / POSE_GRAPH, graph),
+            partial(write_ply, folder / MAP, points),
+        ],
+        [
+            partial(write_pose_bag, folder / TRAJECTORY_BAG, topics),
+            partial(write_cloud_bag, folder / MAP_BAG, "/map", "map", stamp, points),
+        ],
+    )
+
+
+def _write_reference(path: Path, reference: Trajectory | None) -> None:
+    if reference is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_tum(path, reference)
 
 
 def link_reference_map(folder: Path, surface: Path | None) -> None:

@@ -16,7 +16,7 @@ from lifelong_slam.errors import LifelongSlamError
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 KNOWN_ERRORS = (LifelongSlamError, EvalError, HydraException, OmegaConfBaseException, OSError)
-BAD_INPUT, DOUBTFUL, INTERRUPTED = 2, 3, 130
+INCOMPLETE, BAD_INPUT, DOUBTFUL, INTERRUPTED = 1, 2, 3, 130
 
 
 def run_command(

@@ -120,7 +120,7 @@ def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, s
     trajectory, points, graph = metrics["trajectory"], metrics["map"], metrics["graph"]
     scans, rate = len(record.timeline), record.scans_per_second
     yield "Scans", f"{scans} in {record.wall_seconds:.1f} s ({rate:.1f} scans/s)"
-    if "path_length_m" in trajectory:
+    if trajectory.get("path_length_m") is not None:
         yield "Path", f"{trajectory['path_length_m']:.1f} m"
     if trajectory.get("mae_m") is not None:
         yield (
@@ -130,13 +130,13 @@ def _rows(record: "RunRecord", metrics: dict[str, Any]) -> Iterator[tuple[str, s
         )
     elif "position_error" in trajectory["reasons"]:
         yield "Trajectory error", trajectory["reasons"]["position_error"]
-    if "vertices" in graph:
+    if graph.get("vertices") is not None:
         yield (
             "Pose graph",
             f"{graph['vertices']} vertices, {graph['edges']} edges: {graph['loop_edges']} loop closures,"
             f" {graph['composed_edges']} composed of several measurements",
         )
-    if "points" in points:
+    if points.get("points") is not None:
         yield "Map", f"{points['points']:,} points"
     if points.get("mean_distance_m") is not None:
         mean = points["mean_distance_m"]["map_to_reference"]

@@ -3,6 +3,8 @@
 import hashlib
 import os
 import signal
+import sqlite3
+from contextlib import closing
 from dataclasses import fields, is_dataclass
 
 import numpy as np
@@ -97,6 +99,28 @@ def new_map(path, count=5):
         for i in range(count):
             store.write(drive(i))
         store.end_session(session)
+
+
+def make_older(path, version):
+    """Turn a map into one of an older format.
+
+    The second one had no generations; in the first one edges were odometry or loop closures.
+    """
+    with closing(sqlite3.connect(path)) as db:
+        db.executescript(
+            "ALTER TABLE map DROP COLUMN generation; ALTER TABLE map DROP COLUMN parent;"
+            f"PRAGMA user_version = {version}"
+        )
+        if version == 1:
+            (table,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'edges'").fetchone()
+            old_table = table.replace(", 'composed'", "")
+            db.executescript(
+                "PRAGMA foreign_keys = OFF; CREATE TABLE kept AS SELECT * FROM edges;"
+                f"DROP TABLE edges; {old_table};"
+                "INSERT INTO edges SELECT * FROM kept; DROP TABLE kept;"
+                "CREATE INDEX edges_of_source ON edges (source);"
+                "CREATE INDEX edges_of_target ON edges (target)"
+            )
 
 
 def write_until_killed(path, pipe):

@@ -84,7 +84,7 @@ def overwritten_in_the_middle(path):
         (text, "not a database|not a map"),
         (folder, "not a file"),
         (other_database, "not a map of lifelong_slam"),
-        (newer_format, "map format 99; this version of lifelong_slam knows 1 to 2"),
+        (newer_format, "map format 99; this version of lifelong_slam knows 1 to 3"),
         (truncated, "malformed|damaged"),
         (cut_to_its_header, "malformed|damaged|not a database"),
         (with_unreadable_names, "names of its tables"),

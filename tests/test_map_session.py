@@ -1,7 +1,12 @@
 """Sessions in one map file: joined where they belong, kept apart where not, resumed after a cut-off."""
 
+import errno
 import logging
+import multiprocessing
+import os
+import re
 import shutil
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +32,7 @@ import run
 from lifelong_slam.errors import ConfigError, MapError
 from lifelong_slam.geometry import exp, invert
 from lifelong_slam.graph.pose_graph import PoseGraph
+from lifelong_slam.mapping import map_file
 from lifelong_slam.mapping.map_check import check_map
 from lifelong_slam.mapping.store import MapStore
 from lifelong_slam.odometry.kiss_icp import KissIcpOdometry
@@ -515,3 +521,105 @@ def test_a_map_that_makes_no_sense_is_a_wrong_setting(
     ):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+# --- a file that can't be written any more
+
+
+def fill(session, pages):
+    """Let the map grow by some pages only, as on a disk that is nearly full."""
+    db = session._store._connection
+    (now,) = db.execute("PRAGMA page_count").fetchone()
+    db.execute(f"PRAGMA max_page_count = {now + pages}")
+
+
+@pytest.mark.parametrize("pages", [0, 40])
+def test_a_run_goes_on_without_a_map_file_that_cannot_be_written(path, second, caplog, pages):
+    before, expected = load(path), run_session(Path(shutil.copy(path, f"{path}.2")), second)
+    slam = pipeline(second.odometry(), **WINDOW)
+    with open_session(path) as session:
+        fill(session, pages)
+        slam.begin(session)
+        for scan in second.scans:
+            slam.process(scan)
+        result = slam.finish()
+        assert re.search(r"place\.map .*full", str(session.failure))
+    (message,) = [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR]
+    assert re.search(r"place\.map .* full: the run goes on without it", message)
+    np.testing.assert_array_equal(result.trajectory.poses, expected.trajectory.poses)
+    np.testing.assert_array_equal(result.map_points, expected.map_points)
+    assert result.counts == expected.counts
+    saved = load(path)
+    assert check_map(path) == []
+    assert [session.finished for session in saved.sessions] == [True, False]
+    assert before.next_keyframe <= saved.next_keyframe
+    assert saved.next_keyframe < before.next_keyframe + expected.counts["keyframes"]
+    run_session(path, replace(second, number=2))
+    assert check_map(path) == []
+
+
+def test_a_map_that_cannot_be_closed_is_no_reason_to_lose_a_run(path, second, monkeypatch, caplog):
+    with open_session(path) as session:
+        slam = pipeline(second.odometry(), **WINDOW)
+        slam.begin(session)
+        slam.process(second.scans[0])
+        with monkeypatch.context() as patch:
+            error = sqlite3.OperationalError("database or disk is full")
+            error.sqlite_errorcode = sqlite3.SQLITE_FULL
+            patch.setattr(map_file, "close", raising(error))
+            slam.finish()
+    assert "full" in str(session.failure)
+    assert "the run goes on without it" in caplog.text
+
+
+def raising(error):
+    def function(*_):
+        raise error
+
+    return function
+
+
+# --- many processes make one map
+
+
+def open_at_once(path, barrier, answers):
+    barrier.wait()
+    try:
+        with open_session(path) as session:
+            session.end()
+            answers.put(session.id)
+    except MapError as error:
+        answers.put(str(error))
+
+
+def test_processes_that_make_one_map_at_the_same_time_lose_no_session(tmp_path):
+    fork = multiprocessing.get_context("fork")
+    for attempt in range(8):
+        path = tmp_path / f"{attempt}.map"
+        barrier, answers = fork.Barrier(3), fork.SimpleQueue()
+        children = [
+            fork.Process(target=open_at_once, args=(path, barrier, answers)) for _ in range(3)
+        ]
+        for child in children:
+            child.start()
+        for child in children:
+            child.join()
+        said = [answers.get() for _ in children]
+        sessions = sorted(answer for answer in said if isinstance(answer, int))
+        assert sessions == list(range(len(load(path).sessions)))
+        assert sessions
+        assert all("in use" in answer for answer in said if isinstance(answer, str))
+    assert len(list(tmp_path.iterdir())) == 8
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_map_that_is_there_is_not_replaced(path, monkeypatch, links):
+    if not links:
+        refused = OSError(errno.EPERM, "no hard links on this file system")
+        monkeypatch.setattr(os, "link", raising(refused))
+    before = contents(path.parent)
+    with pytest.raises(MapError, match="there already"):
+        MapStore.create(path, *list(SETTINGS.values())[:3])
+    assert contents(path.parent) == before
+    MapStore.create(path.with_name("other.map"), *list(SETTINGS.values())[:3]).close()
+    assert sorted(contents(path.parent)) == ["other.map", "place.map"]

@@ -4,16 +4,20 @@ import json
 import logging
 import os
 import re
+import resource
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from run_support import room, write_folder
 
 import run
 from lifelong_slam.io.ply import write_ply
+from lifelong_slam.mapping.map_check import check_map
+from lifelong_slam.run_start import claimed
 from lifelong_slam.trajectory import read_tum
 
 ROOT = Path(__file__).parent.parent
@@ -202,6 +206,94 @@ def test_a_metric_that_cannot_be_made_ends_the_run_before_it_begins(cli, tmp_pat
     assert (status, out) == (2, "")
     assert "nowhere.Speed can't be loaded" in err
     assert {path.name for path in tmp_path.iterdir()} == {"scans"}
+
+
+def ids(folder):
+    """Return the ids of the runs that config and figures are of."""
+    config = yaml.safe_load((folder / ".hydra" / "config.yaml").read_text())
+    return config["run_id"], json.loads((folder / "metrics.json").read_text())["run"]["id"]
+
+
+def test_a_run_folder_used_twice_has_the_second_run_and_keeps_the_first(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 4)
+    command = [*SYSTEM, "scenario=folder", f"scenario.path={scans}", "hydra.run.dir=run"]
+    folder, before = Path("run"), Path("run/.previous")
+    assert cli(*command, "seed=1")[0] == 0
+    (first, same) = ids(folder)
+    assert first == same
+    (folder / ".map-abcd1234.ply").write_text("half")
+    status, _, err = cli(*command, "seed=2")
+    assert status == 0
+    assert "run had results of an earlier run: they are in .previous now" in err
+    assert {path.name for path in folder.iterdir()} == FILES | {".previous"}
+    assert {path.name for path in before.iterdir()} == FILES - {"run.log"}
+    assert ids(before) == (first, first)
+    assert len({*ids(folder), first}) == 2
+    overrides = [
+        yaml.safe_load((f / ".hydra/overrides.yaml").read_text()) for f in (folder, before)
+    ]
+    assert [lines[-1] for lines in overrides] == ["seed=2", "seed=1"]
+
+
+@pytest.mark.parametrize("wrong", ["scenario.path=nowhere", "sensor.min_range=90"])
+def test_a_run_that_cannot_begin_leaves_the_results_of_an_earlier_one(cli, tmp_path, wrong):
+    scans = write_folder(tmp_path / "scans", 3)
+    command = [*SYSTEM, "scenario=folder", f"scenario.path={scans}", "hydra.run.dir=run"]
+    assert cli(*command)[0] == 0
+    before = {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()}
+    assert cli(*command, wrong)[0] == 2
+    assert {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_in_which_another_run_is_at_work_is_left_alone(cli, tmp_path):
+    scans = write_folder(tmp_path / "scans", 3)
+    (tmp_path / "run" / ".hydra").mkdir(parents=True)
+    (tmp_path / "run" / ".hydra" / "config.yaml").write_text("run_id: other\n")
+    with claimed(tmp_path / "run"):
+        status, _, err = cli(
+            *SYSTEM, "scenario=folder", f"scenario.path={scans}", "hydra.run.dir=run"
+        )
+    assert status == 2
+    assert err.count("\n") == 1
+    assert re.search(r"another run is at work in .*/run: choose a folder by hydra\.run\.dir", err)
+    assert (tmp_path / "run" / ".hydra" / "config.yaml").read_text() == "run_id: other\n"
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {".hydra", "run.log"}
+
+
+@pytest.fixture
+def room_for():
+    """Have the system refuse files of more than some bytes, as a disk that is nearly full does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_what_does_not_fit_on_the_disk_is_named_and_the_rest_is_written(cli, tmp_path, room_for):
+    scans = write_folder(tmp_path / "scans", 12)
+    room_for(100_000)
+    status, out, err = cli(
+        "sensor=solid_state", "scenario=folder", f"scenario.path={scans}", "hydra.run.dir=run",
+        "map=place.map",
+    )  # fmt: skip
+    room_for(resource.RLIM_INFINITY)
+    assert status == 1
+    message = err.splitlines()[-1]
+    assert message.startswith("error: not all could be written: map.ply, ")
+    assert re.search(
+        rf"report\.html, map\.bag in {tmp_path}/run: File too large; place\.map", message
+    )
+    assert "place.map can't be used: " in err
+    assert "the run goes on without it" in err
+    assert "Traceback" not in err
+    assert {"trajectory.tum", "metrics.json", "timeline.csv", "pose_graph.g2o"} <= {
+        path.name for path in (tmp_path / "run").iterdir()
+    }
+    assert not [path for path in (tmp_path / "run").iterdir() if path.name.startswith(".map")]
+    metrics = json.loads(Path("run/metrics.json").read_text())
+    assert metrics["trajectory"]["path_length_m"] > 0
+    assert metrics["map"]["points"] is None
+    assert check_map(tmp_path / "place.map") == []
+    assert f"Run folder: {tmp_path}/run" in out
 
 
 SIGNALLING = """

@@ -1,5 +1,9 @@
 """A small campaign, recorded: what the bag holds, and that it agrees with the truth beside it."""
 
+import errno
+import json
+import re
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -8,12 +12,14 @@ import numpy as np
 import open3d as o3d
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader, Writer
 
 from lifelong_slam.errors import ConfigError, SourceError
 from lifelong_slam.scan import Scan
 from lifelong_slam.simulation import source as source_module
 from lifelong_slam.simulation.campaign import Campaign, make_campaign
-from lifelong_slam.simulation.recorder import START_STAMP
+from lifelong_slam.simulation.messages import TYPESTORE
+from lifelong_slam.simulation.recorder import START_STAMP, record
 from lifelong_slam.simulation.returns import Label
 from lifelong_slam.simulation.sensors import make_sensor
 from lifelong_slam.simulation.source import SimulatedSource, ensure_recorded
@@ -286,6 +292,18 @@ def test_an_interrupted_recording_leaves_nothing(
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
+def test_a_full_disk_is_said_to_be_where_the_recording_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(campaign: Campaign, folder: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(source_module, "record", full)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/test-"):
+        ensure_recorded(tiny(), tmp_path)
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+
+
 def test_what_a_killed_recording_left_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -303,13 +321,75 @@ def test_only_one_of_several_records(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def slow(campaign: Campaign, folder: Path) -> None:
         calls.append(folder)
-        (folder / "campaign.bag").write_bytes(b"#ROSBAG")
+        record(campaign, folder)
 
     monkeypatch.setattr(source_module, "record", slow)
     with ThreadPoolExecutor(4) as pool:
         folders = list(pool.map(lambda _: ensure_recorded(tiny(), tmp_path), range(4)))
     assert len(calls) == 1
     assert len(set(folders)) == 1
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def lose_a_chunk(bag: Path) -> None:
+    """Replace a bag by a whole one that holds fewer sweeps, as a tool that repairs bags does."""
+    with Reader(bag) as reader, Writer(bag.with_suffix(".new")) as writer:
+        topics = {c.topic: c for c in reader.connections}
+        for topic, c in topics.items():
+            added = writer.add_connection(topic, c.msgtype, typestore=TYPESTORE)
+            for _, stamp, data in list(reader.messages([c]))[:-1]:
+                writer.write(added, stamp, data)
+    bag.with_suffix(".new").replace(bag)
+
+
+def forget_sizes(path: Path) -> None:
+    """Make campaign.json one of those from before it had sizes."""
+    description = json.loads(path.read_text())
+    del description["sizes"]
+    path.write_text(json.dumps(description))
+
+
+@pytest.mark.parametrize(
+    ("name", "harm", "what"),
+    [
+        ("campaign.bag", cut, r"campaign.bag has \d+ bytes of \d+"),
+        ("truth.tum", cut, r"truth.tum has \d+ bytes of \d+"),
+        ("surface.ply", Path.unlink, r"surface.ply"),
+        ("campaign.json", cut, "campaign.json can't be read"),
+        ("campaign.json", Path.unlink, r"campaign.json"),
+    ],
+)
+def test_a_damaged_recording_is_recorded_again(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    name: str,
+    harm: Callable[[Path], None],
+    what: str,
+) -> None:
+    folder = ensure_recorded(tiny(), tmp_path)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    harm(folder / name)
+    assert ensure_recorded(tiny(), tmp_path) == folder
+    assert re.search(f"{folder} is damaged .*{what}.*recording it again", caplog.text)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 1
+
+
+@pytest.mark.parametrize("harm", [None, cut, lose_a_chunk])
+def test_a_recording_from_before_there_were_sizes_is_checked_by_its_sweeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harm: Callable[[Path], None] | None
+) -> None:
+    folder = ensure_recorded(tiny(), tmp_path)
+    forget_sizes(folder / "campaign.json")
+    again: list[Path] = []
+    monkeypatch.setattr(source_module, "record", lambda campaign, folder: again.append(folder))
+    if harm:
+        harm(folder / "campaign.bag")
+    ensure_recorded(tiny(), tmp_path)
+    assert bool(again) == bool(harm)
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ T = TypeVar("T")
 
 _Vector = tuple[float, float, float]
 _SWEEP = "multirun.yaml"
+_PREVIOUS = ".previous"  # where a run puts what an earlier one left in its folder
 _NO_FOLDER = "it left no folder: it failed or was not started"
 _MOST_JOBS = 100_000  # of a multirun
 
@@ -150,7 +151,7 @@ def find_runs(roots: Sequence[Path]) -> Runs:
             finished.append(found)
         else:
             missing.append(found)
-    for sweep in _unique(file for root in roots for file in sorted(root.rglob(_SWEEP))):
+    for sweep in _unique(file for root in roots for file in sorted(_below(root, _SWEEP))):
         missing += _jobs_without_folder(sweep)
     newest, earlier = _newest(finished)
     if not newest:
@@ -178,6 +179,8 @@ def read_run(folder: Path) -> Run | Missing:
             overrides = _overrides(lines)
     except (FileError, OSError) as error:
         return Missing(str(folder), f"it can't be read: {' '.join(str(error).split())}")
+    if config and info.get("id") != config.get("run_id"):
+        return Missing(str(folder), "config and metrics.json are of different runs")
     if info.get("interrupted"):
         return Missing(str(folder), "it was stopped early")
     return Run(folder, overrides, groups, config, metrics)
@@ -195,9 +198,16 @@ def differing(runs: Sequence[Run]) -> list[str]:
 
 
 def _run_folders(root: Path) -> Iterator[Path]:
-    with_metrics = {file.parent for file in root.rglob("metrics.json")}
-    with_config = {file.parent.parent for file in root.rglob(".hydra/hydra.yaml")}
+    with_metrics = {file.parent for file in _below(root, "metrics.json")}
+    with_config = {file.parent.parent for file in _below(root, ".hydra/hydra.yaml")}
     yield from sorted(with_metrics | with_config, key=_natural)
+
+
+def _below(root: Path, pattern: str) -> Iterator[Path]:
+    """Yield the files below a folder that fit a pattern, but for those of runs that were set aside."""
+    for file in root.rglob(pattern):
+        if not any(part.startswith(_PREVIOUS) for part in file.relative_to(root).parts):
+            yield file
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -235,8 +245,8 @@ def _jobs_without_folder(sweep: Path) -> list[Missing]:
     try:
         with readable(sweep, "multirun's config"):
             jobs = _jobs(_load(sweep))
-            folders = sweep.parent.rglob(".hydra/hydra.yaml")
-            there = {int(_load(file).hydra.job.num) for file in folders}
+            configs = _below(sweep.parent, ".hydra/hydra.yaml")
+            there = {int(_load(file).hydra.job.num) for file in configs}
     except (FileError, OSError) as error:
         text = " ".join(str(error).split())
         return [Missing(str(sweep), f"the jobs of this multirun can't be counted: {text}")]

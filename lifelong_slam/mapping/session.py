@@ -1,6 +1,8 @@
 """A run's part in a map file: what it finds there, and what it adds as it goes."""
 
-from collections.abc import Collection, Iterable, Mapping
+import logging
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -19,15 +21,21 @@ from lifelong_slam.result import Edge
 Array = NDArray[np.float64]
 Mode = Literal["map", "localize"]
 
+logger = logging.getLogger(__name__)
+
 _TOLERANCE = 1e-6  # between calibrations that count as the same
 
 
 class MapSession:
     """An open map file in which a run is a session, or only looks.
 
+    A file that can't be written any more, as when the disk is full, doesn't end the run: it keeps what it
+    has got by then, as if the run had been killed.
+
     Attributes:
         localize: the map is read, and stays as it is.
         id: of this session.
+        failure: why the file isn't written any more, or None.
     """
 
     def __init__(self, store: MapStore, saved: SavedMap | None, id: int, localize: bool) -> None:
@@ -36,6 +44,8 @@ class MapSession:
         self._saved = saved
         self.id = id
         self.localize = localize
+        self.failure: MapError | None = None
+        self._is_open = True
         # Sessions in a frame of their own; one may be joined to the map by a later one.
         self._unlocated = {s.id for s in saved.sessions if not s.located} if saved else set()
         if id > 0 or localize:
@@ -79,7 +89,7 @@ class MapSession:
         """
         localize = mode == "localize"
         if not path.exists() and not localize:
-            MapStore.create(path, sensor, T_base_sensor, voxel_size).close()
+            _make(path, sensor, T_base_sensor, voxel_size)
         with MapStore.open(path, read_only=True) as look:  # a map that doesn't fit stays untouched
             _check_fit(path, look.info(), sensor, T_base_sensor, voxel_size)
         store = MapStore.open(path, read_only=localize)
@@ -95,7 +105,9 @@ class MapSession:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._store.close()
+        if self._is_open:
+            with self._going_on():
+                self._close()
 
     def take_saved(self) -> SavedMap | None:
         """Return the map as earlier sessions left it, once; None for a new one."""
@@ -130,7 +142,7 @@ class MapSession:
             located = self._unlocated & _located(graph, vertices)
         self._roots = roots
         self._unlocated -= located
-        if self.localize:
+        if self.localize or self.failure:
             return
         edges, rejected, poses = graph.keyed_edges(), graph.rejected_keys, graph.poses()
         update = MapUpdate(
@@ -146,13 +158,43 @@ class MapSession:
             places=places,
             located=located,
         )
-        self._store.write(update)
+        with self._going_on():
+            self._store.write(update)
         self._edges, self._rejected, self._poses = edges, rejected, poses
 
     def end(self) -> None:
-        """Mark the session as finished."""
-        if not self.localize:
-            self._store.end_session(self.id)
+        """Mark the session as finished and close the file, which then has to be written no more."""
+        if not self.localize and not self.failure:
+            with self._going_on():
+                self._store.end_session(self.id)
+                self._close()
+
+    def _close(self) -> None:
+        self._is_open = False
+        self._store.close()
+
+    @contextmanager
+    def _going_on(self) -> Iterator[None]:
+        """Have the run go on without a file that can't be written.
+
+        It isn't closed yet, which would take the space that results may have.
+        """
+        try:
+            yield
+        except MapError as error:
+            if self.failure is None:
+                logger.error("%s: the run goes on without it", error)
+                self.failure = error
+                self._store.release_space()
+
+
+def _make(path: Path, sensor: str, T_base_sensor: Array, voxel_size: float) -> None:
+    """Make a map, unless another process does so at the same time."""
+    try:
+        MapStore.create(path, sensor, T_base_sensor, voxel_size).close()
+    except MapError:
+        if not path.exists():
+            raise
 
 
 def _located(graph: PoseGraph, vertices: Mapping[int, Keyframe]) -> set[int]:

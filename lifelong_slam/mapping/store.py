@@ -7,12 +7,12 @@ keyframe in flight.
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lifelong_slam import __version__
 from lifelong_slam.errors import MapError
-from lifelong_slam.mapping import codec, map_file
+from lifelong_slam.mapping import codec, map_file, map_log
 from lifelong_slam.mapping.map_reading import read_info, read_map
 from lifelong_slam.mapping.map_writing import write_update
 from lifelong_slam.mapping.saved_map import Array, MapInfo, MapUpdate, SavedMap
@@ -69,6 +69,11 @@ class MapStore:
         """Close the file; after a writer it is a single file again."""
         with map_file.errors_of(self._path):
             map_file.close(self._connection)
+
+    def release_space(self) -> None:
+        """After a write that failed, take no more space than what was committed needs."""
+        with suppress(OSError):
+            map_log.cut_to_commit(self._path)
 
     def begin_session(self, source: str, config: str) -> int:
         """Add a session and return its id; the first one counts as located.
@@ -127,6 +132,7 @@ class MapStore:
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         """Commit what happens inside, or roll it back."""
         with map_file.errors_of(self._path), self._connection as db:
+            map_log.keep_short(db, self._path)
             db.execute("BEGIN IMMEDIATE")
             db.execute("PRAGMA defer_foreign_keys = ON")
             yield db

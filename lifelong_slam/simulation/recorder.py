@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Writer
+from rosbags.rosbag1 import Reader, ReaderError, Writer
 
 from lifelong_slam.scan import NANOSECONDS
 from lifelong_slam.simulation.campaign import SIMULATION_VERSION, Campaign
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 START_STAMP = 1_655_283_600 * NANOSECONDS  # 15 June 2022, 09:00 UTC
 _SEASON = 91 * 86_400 * NANOSECONDS  # from one session to the next
-BAG_NAME, TRUTH_NAME = "campaign.bag", "truth.tum"
+CAMPAIGN_NAME, BAG_NAME, TRUTH_NAME = "campaign.json", "campaign.bag", "truth.tum"
 SURFACE_NAME, WORLD_NAME, MOVABLES_NAME = "surface.ply", "world.ply", "movable.npz"
 
 _SURFACE_SPACING = 2.0  # metres driven between the places that the surface is looked at from
@@ -56,8 +56,37 @@ def record(campaign: Campaign, folder: Path) -> None:
     logger.info("recording %s: %d triangles", campaign.name, len(world.static))
     _write_bag(campaign, world, casters, folder)
     _write_truth(campaign, world, casters, folder)
-    description = {"simulation_version": SIMULATION_VERSION, **campaign.settings()}
-    (folder / "campaign.json").write_text(json.dumps(description, indent=2) + "\n")
+    description = {
+        "simulation_version": SIMULATION_VERSION,
+        **campaign.settings(),
+        "sizes": {path.name: path.stat().st_size for path in sorted(folder.iterdir())},
+    }
+    (folder / CAMPAIGN_NAME).write_text(json.dumps(description, indent=2) + "\n")
+
+
+def damage(campaign: Campaign, folder: Path) -> str | None:
+    """Say what is wrong with the recording of a campaign, as of a copy that was cut short; or None.
+
+    Files must have the sizes that campaign.json gives (those from before it did have none), and the bag
+    each sensor's sweeps.
+    """
+    try:
+        sizes = json.loads((folder / CAMPAIGN_NAME).read_text()).get("sizes", {})
+        for name, size in sizes.items():
+            if (found := (folder / name).stat().st_size) != size:
+                return f"{name} has {found} bytes of {size}"
+        with Reader(folder / BAG_NAME) as bag:
+            counts = {connection.topic: connection.msgcount for connection in bag.connections}
+    except (ValueError, AttributeError):
+        return f"{CAMPAIGN_NAME} can't be read"
+    except OSError as error:
+        return f"{Path(error.filename).name}: {error.strerror}"
+    except ReaderError as error:
+        return f"{BAG_NAME}: {error}"
+    for topic in (make_sensor(name).topic for name in campaign.rig):
+        if counts.get(topic) != sweep_count(campaign):
+            return f"{BAG_NAME} has {counts.get(topic, 0)} sweeps of {sweep_count(campaign)}"
+    return None
 
 
 def start_stamp(campaign: Campaign) -> int:

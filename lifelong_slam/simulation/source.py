@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from lifelong_slam.errors import ConfigError
 from lifelong_slam.scan import Scan
 from lifelong_slam.simulation.campaign import Campaign, make_campaign
-from lifelong_slam.simulation.recorder import BAG_NAME, SURFACE_NAME, TRUTH_NAME, record
+from lifelong_slam.simulation.recorder import (
+    BAG_NAME,
+    SURFACE_NAME,
+    TRUTH_NAME,
+    damage,
+    record,
+)
 from lifelong_slam.simulation.sensors import make_sensor
 from lifelong_slam.sources.bag import BagSource
 from lifelong_slam.trajectory import Trajectory, read_tum
@@ -106,19 +112,22 @@ class SimulatedSource:
 
 
 def ensure_recorded(campaign: Campaign, cache_dir: Path) -> Path:
-    """Return the folder of the campaign's recording, making it if it isn't there.
+    """Return the folder of the campaign's recording, making it if it isn't there or is damaged.
 
     The folder appears whole or not at all. Of several processes one records, the others wait.
     """
     folder = cache_dir / f"{campaign.name}-{campaign.digest()}"
-    if folder.is_dir():
+    if folder.is_dir() and not damage(campaign, folder):
         return folder
     cache_dir.mkdir(parents=True, exist_ok=True)
     with _locked(cache_dir / f".{folder.name}.lock"):
         # The holder of the lock is the only one at work, so any other attempt was cut off.
         for leftover in cache_dir.glob(f".{folder.name}-*"):
             shutil.rmtree(leftover, ignore_errors=True)
-        if not folder.is_dir():
+        what = damage(campaign, folder)
+        if folder.is_dir() and what:
+            logger.warning("%s is damaged (%s): recording it again", folder, what)
+        if what:
             _record_whole(campaign, folder)
     return folder
 
@@ -128,7 +137,11 @@ def _record_whole(campaign: Campaign, folder: Path) -> None:
     try:
         record(campaign, temporary)
         temporary.chmod(0o755)
+        shutil.rmtree(folder, ignore_errors=True)
         temporary.rename(folder)
+    except OSError as error:
+        error.filename = error.filename or str(folder)  # as when the disk is full
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
