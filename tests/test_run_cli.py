@@ -280,7 +280,7 @@ def test_what_does_not_fit_on_the_disk_is_named_and_the_rest_is_written(cli, tmp
     message = err.splitlines()[-1]
     assert message.startswith("error: not all could be written: map.ply, ")
     assert re.search(
-        rf"report\.html, map\.bag in {tmp_path}/run: File too large; place\.map", message
+        rf"report\.html, map\.bag in {tmp_path}/run: File too large; {tmp_path}/place\.map", message
     )
     assert "place.map can't be used: " in err
     assert "the run goes on without it" in err
