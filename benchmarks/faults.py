@@ -129,20 +129,24 @@ def torn(folder: Path, seconds: float, rng: random.Random) -> list[Faults]:
     while not log.exists() or log.stat().st_size < _LONG_LOG:
         killed_writer(path, 1.0, faults)
     whole, sound = path.read_bytes(), log.read_bytes()
-    before = None
-    for number in tries(seconds):
-        for file in folder.glob("place.map*"):
-            file.unlink()
-        path.write_bytes(whole)
-        if number:
-            kept = sound[: rng.randrange(_HEADER, len(sound))]
-            log.write_bytes(kept + rng.randbytes(rng.choice((0, 0, 100, 5000))))
-        there = keyframes_of(path, faults)
-        before = there if before is None else before  # without a log
-        faults.tries += bool(number)
+    before = _restored(path, whole, None, faults)
+    for _ in tries(seconds):
+        kept = sound[: rng.randrange(_HEADER, len(sound))]
+        there = _restored(path, whole, kept + rng.randbytes(rng.choice((0, 0, 100, 5000))), faults)
+        faults.tries += 1
         faults.lost += max(0, before - there)
         faults.count("with keyframes of the log" if there > before else "without")
     return [faults]
+
+
+def _restored(path: Path, content: bytes, log: bytes | None, faults: Faults) -> int:
+    """Return how many keyframes a map of this content has, with a log beside it or without one."""
+    for file in path.parent.glob("place.map*"):
+        file.unlink()
+    path.write_bytes(content)
+    if log is not None:
+        path.with_name("place.map-wal").write_bytes(log)
+    return keyframes_of(path, faults)
 
 
 def keyframes_of(path: Path, faults: Faults) -> int:

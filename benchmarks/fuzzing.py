@@ -59,6 +59,7 @@ MOST_SECONDS, MOST_BYTES = 2.0, 500_000_000
 REFUSALS = (LifelongSlamError, EvalError, OSError)
 _READ, _REFUSED, _TRACEBACK = range(3)  # exit statuses of a reader's process
 _LIMITS = {resource.RLIMIT_CPU: 5, resource.RLIMIT_AS: 8 << 30, resource.RLIMIT_CORE: 0}
+_PATIENCE = 30  # seconds of wall time after which a reader that waits is ended
 _STAMP = 1_700_000_000_000_000_000
 
 
@@ -82,7 +83,7 @@ class Outcome:
     """What became of the mutated files of a format.
 
     Attributes:
-        counts: ``read``, ``refused``, ``traceback``, ``abort``, ``slow`` and ``large``.
+        counts: ``read``, ``refused``, ``traceback``, ``abort``, ``hang``, ``slow`` and ``large``.
         escaped: the first line of what went wrong, with the seed of the file.
     """
 
@@ -226,7 +227,7 @@ def attempt(read: Callable[[Path], object], file: Path) -> tuple[str, str]:
 
     Returns:
         What became of it: ``read``, ``refused`` (by an error that names a file), ``traceback``,
-        ``abort``, ``slow`` or ``large``; and the error's text.
+        ``abort``, ``hang``, ``slow`` or ``large``; and the error's text.
     """
     ours, theirs = os.pipe()
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -239,6 +240,8 @@ def attempt(read: Callable[[Path], object], file: Path) -> tuple[str, str]:
         said = pipe.read().strip()
     _, status, used = os.wait4(child, 0)
     code = os.waitstatus_to_exitcode(status)
+    if code == -signal.SIGALRM:
+        return "hang", f"more than {_PATIENCE} s {said}"
     if code == -signal.SIGXCPU or used.ru_utime + used.ru_stime > MOST_SECONDS:
         return "slow", f"{used.ru_utime + used.ru_stime:.1f} s {said}"
     if code not in (_READ, _REFUSED, _TRACEBACK):
@@ -253,6 +256,8 @@ def _read_and_exit(read: Callable[[Path], object], file: Path, pipe: int) -> Non
     code = _TRACEBACK
     for kind, limit in _LIMITS.items():
         resource.setrlimit(kind, (limit, limit))
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(_PATIENCE)
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)

@@ -85,7 +85,7 @@ def _read_pcd(path: Path) -> Points:
 def _read_las(path: Path) -> Points:
     with readable(path, "LAS file"):
         check_las(path)
-        with laspy.open(path) as file:
+        with laspy.open(path, laz_backend=_LAZ) as file:
             promised, cloud = file.header.point_count, file.read()
             step = max(file.header.scales)
     if len(cloud.points) != promised:
@@ -104,6 +104,9 @@ def _columns(records: NDArray[np.void]) -> Points:
         return points.astype(np.float32, copy=False)
     return points.astype(np.float64, copy=False)
 
+
+# The parallel one keeps threads that a forked process has lost, and waits for them for ever.
+_LAZ = laspy.LazBackend.Lazrs
 
 _READERS: dict[str, Callable[[Path], Points]] = {
     ".ply": _read_ply,

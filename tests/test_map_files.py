@@ -1,6 +1,8 @@
 """Maps from PLY, PCD, LAS and LAZ files, and the files that are none."""
 
 import logging
+import os
+import signal
 
 import laspy
 import numpy as np
@@ -214,3 +216,14 @@ def test_missing_and_unknown_files_are_named(tmp_path):
     (tmp_path / "map.obj").write_text("v 1 2 3\n")
     with pytest.raises(FileError, match=r"\.ply, \.pcd, \.las, \.laz"):
         read_map(tmp_path / "map.obj")
+
+
+def test_a_forked_process_reads_laz_as_its_parent_did(tmp_path):
+    path = write_las(tmp_path / "map.laz", cloud())
+    read_map(path)
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)  # in place of pytest-timeout's handler
+        signal.alarm(30)
+        os._exit(0 if len(read_map(path)) == 500 else 1)
+    assert os.wait4(child, 0)[1] == 0
